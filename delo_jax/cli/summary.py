@@ -1,0 +1,84 @@
+"""What a run amounts to, in rows with units."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from delo_jax.cli.console import Row
+from delo_jax.cli.tracking import Result, percentiles_ms
+from delo_jax.metrics.ate import relative_errors
+from delo_jax.metrics.drift import KITTI_LENGTHS_M, Drift, kitti_drift
+
+SHORT_LENGTHS_M = (10.0, 20.0, 30.0, 40.0, 50.0)
+
+
+def run_rows(result: Result) -> list[Row]:
+    """Summary of a run: what was tracked, how fast, and how far off where there is a truth."""
+    trajectory = result.trajectory
+    statuses = ", ".join(f"{status} {count}" for status, count in Counter(trajectory.statuses).most_common())
+    rows = [Row("scans", str(len(trajectory))), Row("path", f"{path_length(trajectory.Ts_world_lidar):.1f}", "m"), Row("status", statuses)]
+    rows += timing_rows({name: seconds for name, seconds in result.timing.items() if name != "simulate"})  # no part of odometry
+    if simulating := percentiles_ms(result.timing.get("simulate", np.zeros(0))):
+        rows.append(Row("simulating (apart), p50 / p95", f"{simulating[0]:.0f} / {simulating[1]:.0f}", "ms"))
+    rows.append(Row("compiling (apart)", f"{result.compile_s:.1f}", "s"))
+    if result.truth is not None and len(trajectory) > 1:
+        rows += accuracy_rows(trajectory.Ts_world_lidar, result.truth)
+    return rows
+
+
+def timing_rows(timing: dict[str, np.ndarray]) -> list[Row]:
+    """Median and 95th percentile per stage and of their sum, and the scans per second that it amounts to."""
+    whole = np.nansum(list(timing.values()), axis=0)
+    found = {name: percentiles_ms(seconds) for name, seconds in (timing | {"whole scan": whole}).items()}
+    rows = [Row(f"{name}, p50 / p95", f"{both[0]:.0f} / {both[1]:.0f}", "ms") for name, both in found.items() if both]
+    return rows + ([Row("rate", f"{len(whole) / whole.sum():.1f}", "scans/s")] if whole.any() else [])
+
+
+def accuracy_rows(Ts_estimated: np.ndarray, Ts_true: np.ndarray) -> list[Row]:
+    """Errors of the steps, and the drift over the segments that fit on the path."""
+    errors = relative_errors(Ts_estimated, Ts_true)
+    rows = [
+        Row("error of a step (median)", f"{100 * np.median(errors.translation_m):.1f}", "cm"),
+        Row("error of a step (median)", f"{np.rad2deg(np.median(errors.rotation_rad)):.3f}", "deg"),
+    ]
+    drift = drift_where_it_fits(Ts_estimated, Ts_true)
+    if drift is None:
+        return rows + [Row("drift", "-", f"path below {SHORT_LENGTHS_M[0]:g} m")]
+    span = span_of(drift)
+    return rows + [
+        Row(f"drift over {span}", f"{drift.t_rel_percent:.2f}", "%"),
+        Row(f"drift over {span}", f"{drift.r_rel_deg_per_100m:.2f}", "deg/100 m"),
+    ]
+
+
+def drift_where_it_fits(Ts_estimated: np.ndarray, Ts_true: np.ndarray) -> Drift | None:
+    """Drift over the benchmark's segments, over 10 to 50 m on shorter paths (from every frame), None on paths below 10 m."""
+    length = path_length(Ts_true)
+    if length > KITTI_LENGTHS_M[0]:
+        return kitti_drift(Ts_estimated, Ts_true)
+    if length > SHORT_LENGTHS_M[0]:
+        return kitti_drift(Ts_estimated, Ts_true, lengths_m=SHORT_LENGTHS_M, step=1)
+    return None
+
+
+def span_of(drift: Drift) -> str:
+    """The segment lengths that did fit, such as "10-50 m"."""
+    fitting = drift.lengths_m[drift.num_segments_by_length > 0]
+    return f"{fitting[0]:g}-{fitting[-1]:g} m" if len(fitting) > 1 else f"{fitting[0]:g} m"
+
+
+def path_length(Ts: np.ndarray) -> float:
+    """Sum of the distances between successive positions [m]."""
+    return float(np.linalg.norm(np.diff(Ts[:, :3, 3], axis=0), axis=-1).sum())
+
+
+def rejected_lines(result: Result, names: Sequence[object], limit: int = 5) -> list[str]:
+    """One sentence for each of the first rejected scans, naming its file."""
+    rejected = [record for record in result.trajectory.records if record.status == "rejected"]
+    lines = []
+    for record in rejected[:limit]:
+        name = str(names[record.index])
+        lines.append(record.reason if record.reason.startswith(name) else f"{name}: {record.reason}")
+    more = len(rejected) - limit
+    return lines + ([f"and {more} more; frames.csv has them all"] if more > 0 else [])

@@ -1,0 +1,1 @@
+"""Rigid geometry in closed form: poses, alignments, planes."""

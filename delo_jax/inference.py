@@ -1,0 +1,145 @@
+"""`odometry(params, src, tgt)`: two scans in, a pose with covariance and status out. Holds the jitted encode and solve."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from delo_jax.errors import ScanError
+from delo_jax.geometry import se3
+from delo_jax.model import delo
+from delo_jax.ops import evidence
+from delo_jax.preprocess import preprocess
+from delo_jax.uncertainty import covariance, status
+
+encode = jax.jit(delo.encode)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """Pose of a pair with its uncertainty and health.
+
+    Variances and the covariance are those of `T_target_source` under a right perturbation, order [omega, v], rad and m.
+    They are the evidence head's own, not calibrated.
+    """
+
+    T_target_source: np.ndarray
+    """(4, 4) float64: maps source points into the target frame."""
+    covariance: np.ndarray
+    """(6, 6)."""
+    aleatoric: np.ndarray
+    """(6,) variances: noise of the data."""
+    epistemic: np.ndarray
+    """(6,) variances: doubt of the model."""
+    status: str
+    """ok, low_confidence, degenerate or rejected."""
+    confidence: float
+    """Probability in [0, 1] that the pair is not lost."""
+    reason: str
+    """Why the status is not ok; empty when it is."""
+
+    def inverted(self) -> "Estimate":
+        """The same estimate of the inverse pose, `T_source_target`, covariance carried through the adjoint."""
+        Ad2 = se3.adjoint(self.T_target_source) ** 2  # of independent axes: variances go through the squares
+        return dataclasses.replace(
+            self,
+            T_target_source=se3.inverse(self.T_target_source),
+            covariance=se3.invert_covariance(self.covariance, self.T_target_source),
+            aleatoric=Ad2 @ self.aleatoric,
+            epistemic=Ad2 @ self.epistemic,
+        )
+
+
+class EncodedScan(NamedTuple):
+    """A scan after preprocessing and the network's encoder; kept, so that no scan is encoded twice."""
+
+    encoding: delo.Encoding
+    num_points: int  # usable points
+
+
+@jax.jit
+def solve(model: delo.Model, source: delo.Encoding, target: delo.Encoding, T_init: jax.Array) -> tuple[delo.Registration, jax.Array]:
+    """Registration of a pair and the probability that it is not lost."""
+    registration = delo.solve(model, source, target, T_init)
+    limits = model.cfg.status
+    bound = jnp.repeat(jnp.array([jnp.radians(limits.lost_rotation_deg), limits.lost_translation_m]), 3)
+    return registration, jnp.prod(evidence.interval_probability(registration.nig, bound))
+
+
+def prepare(params: delo.Model, points: ArrayLike) -> EncodedScan:
+    """Preprocess and encode a scan.
+
+    Raises:
+        ScanError: not an array of numbers of shape (n, 3).
+    """
+    scan = preprocess(np.asarray(points), params.cfg.preprocess)
+    return EncodedScan(encode(params, scan), int(scan.mask.sum()))
+
+
+def align(params: delo.Model, source: EncodedScan, target: EncodedScan, T_target_source_init: np.ndarray) -> Estimate:
+    """Estimate of a pair of encoded scans from a start; see `odometry`."""
+    limits = params.cfg.status
+    start = np.asarray(T_target_source_init, np.float64)
+    solved = jax.device_get(solve(params, source.encoding, target.encoding, jnp.asarray(start, jnp.float32)))
+    result, confidence = solved
+    health = status.judge(
+        num_points=(source.num_points, target.num_points),
+        finite=bool(result.finite),
+        confidence=float(np.nan_to_num(confidence)),
+        observability=result.observability,
+        weakest_axis=result.weakest_axis,
+        cfg=limits,
+    )
+    if health.status == "rejected":
+        T, known = start, covariance.unknown(limits)
+    else:
+        nig = [np.asarray(value, np.float64) for value in result.nig]
+        T, known = se3.exp(se3.log(np.asarray(result.T_target_source, np.float64))), covariance.from_evidence(*nig[1:])
+    return Estimate(
+        T_target_source=T,
+        covariance=known.covariance,
+        aleatoric=known.aleatoric,
+        epistemic=known.epistemic,
+        status=health.status,
+        confidence=health.confidence,
+        reason=health.reason,
+    )
+
+
+def odometry(params: delo.Model, src: ArrayLike, tgt: ArrayLike, *, T_target_source_init: ArrayLike | None = None) -> Estimate:
+    """Relative pose of two scans, with no motion prior.
+
+    Depends on its arguments alone: the same input gives the same bytes. The first call compiles (seconds).
+
+    Args:
+        params: weights, from `delo_jax.load`.
+        src: (N, 3) source points [m], any N.
+        tgt: (M, 3) target points [m], any M.
+        T_target_source_init: optional start; used as a second hypothesis beside the network's own, and as the answer
+            when the pair is rejected. The identity by default.
+
+    Returns:
+        Estimate of `T_target_source`. Too few points or a failed solve never raise: the status says `rejected`.
+
+    Raises:
+        ScanError: wrong shape or dtype of a scan or of the start.
+    """
+    start = np.eye(4) if T_target_source_init is None else check_pose(T_target_source_init)
+    return align(params, prepare(params, src), prepare(params, tgt), start)
+
+
+def check_pose(T: ArrayLike) -> np.ndarray:
+    """A start as a (4, 4) float64 pose.
+
+    Raises:
+        ScanError: wrong shape, or not a rigid transformation.
+    """
+    pose = np.asarray(T, np.float64)
+    if pose.shape != (4, 4):
+        raise ScanError(f"T_target_source_init: expected a (4, 4) pose, got shape {pose.shape}")
+    if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-4) or not np.isfinite(pose).all():
+        raise ScanError("T_target_source_init: expected a rigid transformation, got a matrix whose rotation is not orthonormal")
+    return pose

@@ -1,0 +1,109 @@
+"""Drift of a trajectory as the KITTI odometry benchmark measures it."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float64, Int64
+
+from delo_jax.errors import DeloError
+from delo_jax.metrics._poses import checked_pair
+
+KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+
+
+class Drift(NamedTuple):
+    """Mean drift over all segments, and the same for each segment length."""
+
+    t_rel_percent: float
+    """Translation error per distance, mean over all segments."""
+    r_rel_deg_per_100m: float
+    """Rotation error per distance, mean over all segments."""
+    num_segments: int
+    lengths_m: Float64[np.ndarray, " k"]
+    """The segment lengths asked for; the three tables below have one entry for each."""
+    t_rel_percent_by_length: Float64[np.ndarray, " k"]
+    """NaN where no segment of this length fits on the track."""
+    r_rel_deg_per_100m_by_length: Float64[np.ndarray, " k"]
+    """NaN where no segment of this length fits on the track."""
+    num_segments_by_length: Int64[np.ndarray, " k"]
+
+
+def kitti_drift(
+    Ts_estimated: Float[np.ndarray, "n 4 4"],
+    Ts_true: Float[np.ndarray, "m 4 4"],
+    *,
+    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    step: int = 10,
+) -> Drift:
+    """Relative error over all sub-sequences of given lengths (Geiger et al. 2012, the odometry devkit).
+
+    From every `step`-th frame i and for every length L, frame j is the first whose distance along the *true* path from i is
+    greater than L. The error of the segment is (E_i^-1 E_j)^-1 (G_i^-1 G_j): its translation and its angle are divided by L, and
+    all segments weigh the same in the mean. Inverses are general and the angle is read off the trace, as in the devkit: published
+    trajectories hold rotations that are not quite orthonormal, and their numbers depend on it.
+
+    Args:
+        Ts_estimated: estimated sensor poses, in any fixed world frame.
+        Ts_true: true poses of the same sensor frame, row i beside row i.
+        lengths_m: segment lengths; the benchmark's by default, shorter ones for short tracks.
+        step: a segment starts at every `step`-th frame.
+
+    Returns:
+        Drift in percent and degrees per 100 m.
+
+    Raises:
+        DeloError: wrong shape, unequal lengths, NaN or infinity, or a track shorter than the shortest segment.
+    """
+    estimated, true = checked_pair(Ts_estimated, Ts_true)
+    lengths = np.asarray(lengths_m, dtype=np.float64)
+    if lengths.ndim != 1 or lengths.size == 0 or not np.all(lengths > 0.0):
+        raise DeloError(f"lengths_m: expected one or more lengths above 0, got {lengths_m}")
+    if step < 1:
+        raise DeloError(f"step: expected at least 1, got {step}")
+    starts, ends, which = _segments(true, lengths, step)
+    if starts.size == 0:
+        raise DeloError(
+            f"Ts_true: expected a path longer than the shortest segment of {lengths.min():g} m, "
+            f"got {np.sum(_steps(true)):.1f} m in {len(true)} poses; ask for shorter lengths"
+        )
+    translation_m, rotation_rad = _segment_errors(estimated, true, starts, ends)
+    t_rel = 100.0 * translation_m / lengths[which]
+    r_rel = 100.0 * np.rad2deg(rotation_rad) / lengths[which]
+    counts = np.bincount(which, minlength=lengths.size)
+    return Drift(
+        t_rel_percent=float(np.mean(t_rel)),
+        r_rel_deg_per_100m=float(np.mean(r_rel)),
+        num_segments=int(starts.size),
+        lengths_m=lengths,
+        t_rel_percent_by_length=_means(t_rel, which, counts),
+        r_rel_deg_per_100m_by_length=_means(r_rel, which, counts),
+        num_segments_by_length=counts,
+    )
+
+
+def _steps(Ts: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, " s"]:
+    return np.linalg.norm(np.diff(Ts[:, :3, 3], axis=0), axis=-1)
+
+
+def _segments(Ts_true: Float64[np.ndarray, "n 4 4"], lengths: Float64[np.ndarray, " k"], step: int):
+    """First frame, last frame and index of the length of every segment that fits on the track."""
+    distance = np.concatenate([[0.0], np.cumsum(_steps(Ts_true))])[: len(Ts_true)]
+    starts = np.arange(0, len(Ts_true), step)
+    first, which = np.meshgrid(starts, np.arange(lengths.size), indexing="ij")
+    last = np.searchsorted(distance, distance[first] + lengths[which], side="right")  # strictly farther, as in the devkit
+    fits = last < len(Ts_true)
+    return first[fits], last[fits], which[fits]
+
+
+def _segment_errors(Ts_estimated: np.ndarray, Ts_true: np.ndarray, starts: np.ndarray, ends: np.ndarray):
+    """Translation [m] and rotation [rad] of (E_i^-1 E_j)^-1 (G_i^-1 G_j)."""
+    motions_estimated, motions_true = (np.linalg.solve(Ts[starts], Ts[ends]) for Ts in (Ts_estimated, Ts_true))
+    Ts_error = np.linalg.solve(motions_estimated, motions_true)
+    cosine = 0.5 * (np.trace(Ts_error[:, :3, :3], axis1=1, axis2=2) - 1.0)
+    return np.linalg.norm(Ts_error[:, :3, 3], axis=-1), np.arccos(np.clip(cosine, -1.0, 1.0))
+
+
+def _means(values: Float64[np.ndarray, " s"], which: Int64[np.ndarray, " s"], counts: Int64[np.ndarray, " k"]) -> Float64[np.ndarray, " k"]:
+    sums = np.bincount(which, weights=values, minlength=counts.size)
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)

@@ -1,0 +1,1 @@
+"""The network: the only layer that knows flax."""

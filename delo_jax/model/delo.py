@@ -1,0 +1,226 @@
+"""The model: one params pytree, `encode` once per scan, `solve` once per pair. Pure functions; the caller jits."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from delo_jax.config import DeloConfig
+from delo_jax.geometry import se3
+from delo_jax.model import fine
+from delo_jax.model.coarse import CoarsePose, coarse_pose
+from delo_jax.model.dgcnn import EdgeEncoder
+from delo_jax.model.evidential import EvidenceHead
+from delo_jax.model.matching import Temperature
+from delo_jax.ops import evidence
+from delo_jax.ops.knn import knn
+from delo_jax.ops.transport import matching_cost
+
+full_float32 = jax.default_matmul_precision("highest")
+NUM_FEATURES = 8
+NUM_STATISTICS = 24
+LEVER_M = 15.0  # a rotation moves the scene by about this arm; makes rotations and translations comparable
+
+
+class Network(nn.Module):
+    """All trained layers; each method is one of them."""
+
+    cfg: DeloConfig
+
+    def setup(self):
+        """Name the layers."""
+        self.encoder = EdgeEncoder(self.cfg.coarse)
+        self.matcher = Temperature()
+        self.point_embedding = fine.PointEmbedding(self.cfg.fine)
+        self.edge_network = fine.EdgeNetwork(self.cfg.fine)
+        self.evidence_head = EvidenceHead(self.cfg.evidence)
+
+    def embed(self, features):
+        """Point embeddings of the fine stage."""
+        return self.point_embedding(features)
+
+    def describe(self, points, features, index, mask):
+        """Descriptors of key points."""
+        return self.encoder(points, features, index, mask)
+
+    def temperature(self):
+        """Factor on the cosine similarities of descriptors."""
+        return self.matcher()
+
+    def confidence(self, source, target, geometry):
+        """Logits of the fine stage."""
+        return self.edge_network(source, target, geometry)
+
+    def evidence(self, statistics):
+        """Raw evidence."""
+        return self.evidence_head(statistics)
+
+    def everything(self, points, features, geometry, statistics):
+        """One call of every layer, for `init`."""
+        index = jnp.zeros((points.shape[0], self.cfg.coarse.num_neighbors), jnp.int32)
+        descriptors = self.describe(points, jnp.concatenate([points, features], -1), index, jnp.ones(points.shape[0], bool))
+        embedding = self.embed(features)
+        return descriptors, self.temperature(), self.confidence(embedding, embedding, geometry), self.evidence(statistics)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """Weights and the config they belong to. Arrays are leaves, the config is static."""
+
+    variables: dict[str, Any]
+    cfg: DeloConfig = dataclasses.field(metadata={"static": True})
+
+    def apply(self, method: str, *args):
+        """One layer of the network with these weights."""
+        return Network(self.cfg).apply(self.variables, *args, method=method)
+
+    def confidence(self, source, target, geometry):
+        """Logits of the fine stage, as a function to pass on."""
+        return self.apply("confidence", source, target, geometry)
+
+
+class Encoding(NamedTuple):
+    """What is computed once per scan and kept."""
+
+    cloud: fine.Cloud
+    keypoints: Float[Array, "k 3"]
+    keypoint_normals: Float[Array, "k 3"]
+    keypoint_mask: Bool[Array, " k"]
+    descriptors: Float[Array, "k d"]
+
+
+class Registration(NamedTuple):
+    """Answer of one pair; arrays only."""
+
+    T_target_source: Float[Array, "4 4"]
+    information: Float[Array, "6 6"]  # of a left twist in the target frame, per unit of squared metre
+    nig: evidence.NIG  # of log(T_pred^-1 T_true), order [omega, v], rad and m
+    statistics: Float[Array, " s"]
+    observability: Float[Array, "3"]  # ascending eigenvalues of the mean weighted n n^T; 1/3 each when even
+    weakest_axis: Float[Array, "3"]  # unit direction in the target frame that is seen worst
+    used_coarse: Bool[Array, ""]  # the pose came from the coarse stage, not from T_init
+    finite: Bool[Array, ""]
+
+
+def init(cfg: DeloConfig, key: Key[Array, ""]) -> Model:
+    """Model with random weights, for training only."""
+    points, features = jnp.zeros((4, 3)), jnp.zeros((4, NUM_FEATURES))
+    geometry, _, _ = fine.match_geometry(points, points, points, points, jnp.ones(4, bool))
+    variables = Network(cfg).init(key, points, features, geometry, jnp.zeros(NUM_STATISTICS), method="everything")
+    return Model(variables, cfg)
+
+
+def encode(model: Model, scan) -> Encoding:
+    """Point embeddings and key point descriptors of a `Scan`."""
+    cloud = fine.Cloud(scan.points, scan.normals, model.apply("embed", scan.features), scan.mask)
+    rows, mask = scan.keypoint_index, scan.keypoint_mask
+    points, normals = scan.points[rows], scan.normals[rows]
+    index = knn(points, mask, model.cfg.coarse.num_neighbors)
+    features = jnp.concatenate([normals, scan.features[rows]], axis=-1)
+    return Encoding(cloud, points, normals, mask, model.apply("describe", points, features, index, mask))
+
+
+def matching_scores(model: Model, source: Encoding, target: Encoding) -> Float[Array, "n m"]:
+    """Scores between the key points of two scans."""
+    return model.apply("temperature") * (source.descriptors @ target.descriptors.T)
+
+
+def coarse(model: Model, source: Encoding, target: Encoding) -> CoarsePose:
+    """Pose with no prior, from the key points alone."""
+    cost = matching_cost(source.descriptors, target.descriptors, model.apply("temperature"), target.keypoint_mask)
+    return coarse_pose(
+        cost, source.keypoints, target.keypoints, source.keypoint_mask, target.keypoint_mask, cfg=model.cfg.coarse
+    )
+
+
+def refine_pose(model: Model, source: fine.Cloud, target: fine.Cloud, T_init, *, num_iters: int) -> Float[Array, "t 4 4"]:
+    """Fine stage from a start; `target` is any cloud with normals and embeddings."""
+    return fine.refine(model.confidence, source, target, T_init, num_iters=num_iters, cfg=model.cfg.fine)
+
+
+@full_float32
+def solve(model: Model, source: Encoding, target: Encoding, T_init: Float[Array, "4 4"]) -> Registration:
+    """Pose of a pair, its information, evidence and statistics.
+
+    Two hypotheses, the start and the coarse pose, are refined side by side on half of the points; the one that the
+    learned confidences like better is finished on all of them. A good start is never spoilt by a bad coarse pose,
+    and a bad start never hides a good one.
+
+    Args:
+        model: weights and config.
+        source: encoding of the source scan.
+        target: encoding of the target scan.
+        T_init: start; the identity when nothing is known.
+
+    Returns:
+        Registration with T_target_source.
+    """
+    cfg = model.cfg.fine
+    points, half = _first(source.cloud, cfg.num_points), _first(source.cloud, cfg.num_points // 2)
+    first = coarse(model, source, target)
+    starts = jnp.stack([T_init, first.T_target_source])
+    num_first = cfg.num_iters // 2
+    refined = jax.vmap(lambda T: refine_pose(model, half, target.cloud, T, num_iters=num_first)[-1])(starts)
+    scores = jax.vmap(lambda T: _score(fine.match(model.confidence, half, target.cloud, T)))(refined)
+    best = jnp.argmax(scores)
+    T = refine_pose(model, points, target.cloud, refined[best], num_iters=cfg.num_iters - num_first)[-1]
+    matches = fine.match(model.confidence, points, target.cloud, T)
+    T_delta, information = fine.step(matches, cfg=cfg)
+    disagreement = se3.inverse(refined[1 - best]) @ refined[best]
+    stats = statistics(matches, information, T, T_delta, disagreement, first.inlier_share, scores[1 - best])
+    nig = predict_evidence(model, stats)
+    values, vectors = jnp.linalg.eigh(_direction_spread(matches))
+    finite = jnp.all(jnp.isfinite(T)) & jnp.all(jnp.isfinite(stats))
+    return Registration(T, information, nig, stats, values, vectors[:, 0], best == 1, finite)
+
+
+def predict_evidence(model: Model, stats: Float[Array, " s"]) -> evidence.NIG:
+    """Evidence of the pose error in rad and m."""
+    cfg = model.cfg.evidence
+    nig = evidence.constrain(model.apply("evidence", stats))
+    unit = jnp.repeat(jnp.array([cfg.rotation_scale_rad, cfg.translation_scale_m]), 3)
+    return evidence.NIG(nig.gamma * unit, nig.nu, nig.alpha, nig.beta * unit**2)
+
+
+def _first(cloud: fine.Cloud, num: int) -> fine.Cloud:
+    return jax.tree.map(lambda array: array[:num], cloud)
+
+
+def _score(matches: fine.Matches) -> Float[Array, ""]:
+    """How well a pose explains the scan: mean confidence, counted where the plane distance is small too."""
+    return jnp.mean(matches.weights / (1.0 + (matches.plane_distance / 0.1) ** 2))
+
+
+def _direction_spread(matches: fine.Matches) -> Float[Array, "3 3"]:
+    w = (matches.weights / (jnp.sum(matches.weights) + 1e-6))[:, None]
+    return (w * matches.normals).T @ matches.normals
+
+
+def statistics(matches, information, T, T_delta, disagreement, inlier_share, other_score) -> Float[Array, " s"]:
+    """What the solver knows about its own answer, as numbers of order one; the input of the evidence head."""
+    num_valid = jnp.sum(matches.weights > 0.0)
+    distance = jnp.abs(matches.plane_distance)
+    weight = jnp.sum(matches.weights) + 1e-6
+    rms = jnp.sqrt(jnp.sum(matches.weights * distance**2) / weight)
+    quantiles = jnp.quantile(distance, jnp.array([0.25, 0.5, 0.75, 0.9]))
+    scale = jnp.repeat(jnp.array([1.0 / LEVER_M, 1.0]), 3)
+    eigenvalues = jnp.linalg.eigvalsh(information * scale[:, None] * scale[None, :]) / weight
+    lengths = jnp.stack([length for pose in (T_delta, disagreement, T) for length in _lengths(pose)])
+    score = _score(matches)
+    return jnp.concatenate(
+        [
+            jnp.stack([weight / matches.weights.shape[0], score, other_score, score - other_score]) * 3.0,
+            jnp.log10(jnp.append(quantiles, rms) + 1e-3) + 1.0,
+            jnp.log10(jnp.maximum(eigenvalues, 1e-6)) + 1.0,
+            jnp.log10(lengths + 1e-4) + 1.0,
+            jnp.stack([inlier_share * 2.0, jnp.mean(matches.agreement), num_valid / 1000.0]),
+        ]
+    )
+
+
+def _lengths(T: Float[Array, "4 4"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    return jnp.sqrt(jnp.sum(T[:3, 3] ** 2) + 1e-12), LEVER_M * se3.rotation_angle(T[:3, :3])

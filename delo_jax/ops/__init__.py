@@ -1,0 +1,1 @@
+"""Formulas without layers: neighbours, transport, consistency, evidence."""

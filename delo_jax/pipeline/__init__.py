@@ -1,0 +1,1 @@
+"""Streaming odometry over the scans of one sensor, and the trajectory it leaves."""

@@ -1,0 +1,160 @@
+"""Raw points to a `Scan`: crop, voxels, plane fits, features, key points. Host code (NumPy, SciPy), deterministic."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from delo_jax.config import PreprocessConfig
+from delo_jax.errors import ScanError
+from delo_jax.geometry.normals import plane_fit
+
+NUM_FEATURES = 8
+MIN_NEIGHBORS = 5  # a plane through fewer points says nothing
+HORIZONTAL = 0.85  # |n_z| above which a surface counts as ground-like
+
+
+class Scan(NamedTuple):
+    """One padded scan. Rows are in random order, so that the first N are an even subset; invalid rows come last."""
+
+    points: Float[Array, "m 3"] | Float[np.ndarray, "m 3"]  # sensor frame [m]
+    normals: Float[Array, "m 3"] | Float[np.ndarray, "m 3"]  # unit, towards the sensor
+    features: Float[Array, "m f"] | Float[np.ndarray, "m f"]  # invariant to yaw
+    mask: Bool[Array, " m"] | Bool[np.ndarray, " m"]  # True: a real point
+    keypoint_index: Int[Array, " k"] | Int[np.ndarray, " k"]  # rows of `points`
+    keypoint_mask: Bool[Array, " k"] | Bool[np.ndarray, " k"]
+
+
+def check_points(points: np.ndarray, name: str = "points") -> np.ndarray:
+    """`points` as a float32 array of shape (n, 3).
+
+    Raises:
+        ScanError: not an array of numbers, or not of shape (n, 3).
+    """
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[1] != 3:
+        hint = "; pass points[:, :3]" if points.ndim == 2 and points.shape[1] > 3 else ""
+        raise ScanError(f"{name}: expected an array of shape (n, 3) in metres, got shape {points.shape}{hint}")
+    if points.dtype.kind not in "fiu":
+        raise ScanError(f"{name}: expected numbers, got dtype {points.dtype}; convert to float32")
+    return points.astype(np.float32, copy=False)
+
+
+def preprocess(points: np.ndarray, cfg: PreprocessConfig) -> Scan:
+    """Scan of a sensor sweep.
+
+    Args:
+        points: (n, 3) in the sensor frame [m]; rows that are not finite or out of range are dropped.
+        cfg: sizes and thresholds.
+
+    Returns:
+        A `Scan` of NumPy arrays padded to `cfg.max_points` and `cfg.num_keypoints`; possibly without a single valid point.
+
+    Raises:
+        ScanError: wrong shape or dtype.
+    """
+    cloud = voxel_mean(_crop(check_points(points), cfg), cfg.voxel_m)
+    rng = np.random.default_rng(0)  # the same scan gives the same bytes
+    rows = one_per_voxel(cloud, cfg.point_voxel_m, rng) if len(cloud) else np.zeros(0, np.int64)
+    centers, normals, features, valid = _describe(cloud, rows, cfg)
+    kept = _select(normals, valid, cfg, rng)
+    points, normals, features = centers[kept], normals[kept], features[kept]
+    keypoints = _keypoints(points, normals, cfg, rng)
+    return Scan(
+        _pad(points, cfg.max_points),
+        _pad(normals, cfg.max_points),
+        _pad(features, cfg.max_points),
+        _pad(np.ones(len(kept), bool), cfg.max_points),
+        _pad(keypoints.astype(np.int32), cfg.num_keypoints),
+        _pad(np.ones(len(keypoints), bool), cfg.num_keypoints),
+    )
+
+
+def _crop(points: np.ndarray, cfg: PreprocessConfig) -> np.ndarray:
+    with np.errstate(invalid="ignore", over="ignore"):
+        squared_range = np.einsum("ij,ij->i", points, points)
+        return points[(squared_range > cfg.min_range_m**2) & (squared_range < cfg.max_range_m**2)]  # NaN compares False
+
+
+def _voxel_keys(points: np.ndarray, size: float) -> np.ndarray:
+    cells = np.floor(points * np.float32(1.0 / size)).astype(np.int64) + (1 << 20)
+    return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+
+
+def voxel_mean(points: np.ndarray, size: float) -> np.ndarray:
+    """Mean of the points of every occupied voxel, (v, 3) float32."""
+    if len(points) == 0:
+        return points
+    keys = _voxel_keys(points, size)
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
+    counts = np.diff(np.r_[starts, len(keys)]).astype(np.float32)
+    return np.add.reduceat(points[order], starts, axis=0) / counts[:, None]
+
+
+def one_per_voxel(points: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
+    """Row of one random point per occupied voxel, in random order."""
+    order = rng.permutation(len(points))
+    _, first = np.unique(_voxel_keys(points[order], size), return_index=True)
+    return order[np.sort(first)]
+
+
+def _describe(cloud: np.ndarray, rows: np.ndarray, cfg: PreprocessConfig):
+    """Plane fits around `cloud[rows]`: points (on their plane where there is one), normals, features, validity."""
+    if len(cloud) < MIN_NEIGHBORS:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, NUM_FEATURES), np.float32), np.zeros(0, bool)
+    points = cloud[rows]
+    ranges = np.linalg.norm(points, axis=1)
+    radius = np.minimum(0.5 + 0.04 * ranges, 2.0)
+    tree = cKDTree(cloud, balanced_tree=False, compact_nodes=False)
+    k = min(cfg.num_neighbors, len(cloud))
+    distances, index = tree.query(points, k=k, distance_upper_bound=2.0, workers=2)
+    near = distances <= radius[:, None]
+    center, normal, eigenvalues = plane_fit(cloud[np.where(near, index, rows[:, None])], near)
+    normal = np.where(np.einsum("ij,ij->i", normal, points)[:, None] > 0, -normal, normal)
+    planar = eigenvalues[:, 0] < 0.1 * eigenvalues[:, 1]
+    offset = np.einsum("ij,ij->i", points - center, normal)
+    projected = points - np.where(planar, offset, 0.0)[:, None] * normal
+    count = near.sum(axis=1)
+    mean_distance = np.where(near, distances, 0.0).sum(axis=1) / np.maximum(count, 1)
+    features = _features(projected, normal, eigenvalues, ranges, count / cfg.num_neighbors, mean_distance)
+    valid = (count >= MIN_NEIGHBORS) & (eigenvalues[:, 1] > 1e-6)
+    return projected.astype(np.float32), normal.astype(np.float32), features, valid
+
+
+def _features(points, normals, eigenvalues, ranges, fill, mean_distance) -> np.ndarray:
+    """Eight numbers of order one that do not change when the sensor yaws."""
+    small, middle, large = np.maximum(eigenvalues, 1e-8).T
+    columns = [
+        np.sqrt(small / large),
+        np.sqrt(middle / large),
+        np.log10(small) / 2 + 1.5,  # thickness; 3 cm is 0
+        fill,
+        np.log(np.maximum(mean_distance, 1e-3)) + 1.0,
+        np.log(ranges) - 2.7,
+        points[:, 2] / 3.0,
+        np.abs(normals[:, 2]),
+    ]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def _select(normals: np.ndarray, valid: np.ndarray, cfg: PreprocessConfig, rng: np.random.Generator) -> np.ndarray:
+    """Rows to keep, in random order: everything upright, and ground-like surfaces up to their share."""
+    horizontal = np.abs(normals[:, 2]) > HORIZONTAL
+    ground, rest = np.flatnonzero(valid & horizontal), np.flatnonzero(valid & ~horizontal)
+    num_ground = min(len(ground), int(cfg.ground_share * cfg.max_points))
+    kept = np.r_[ground[:num_ground], rest[: cfg.max_points - num_ground]]
+    return rng.permutation(kept)
+
+
+def _keypoints(points: np.ndarray, normals: np.ndarray, cfg: PreprocessConfig, rng: np.random.Generator) -> np.ndarray:
+    upright = np.flatnonzero((np.abs(normals[:, 2]) < HORIZONTAL) & (np.linalg.norm(points, axis=1) < cfg.keypoint_range_m))
+    return upright[one_per_voxel(points[upright], cfg.keypoint_voxel_m, rng)][: cfg.num_keypoints]
+
+
+def _pad(array: np.ndarray, length: int) -> np.ndarray:
+    padded = np.zeros((length, *array.shape[1:]), array.dtype)
+    padded[: len(array)] = array
+    return padded

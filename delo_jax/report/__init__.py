@@ -1,0 +1,1 @@
+"""Pictures of a run. Figures are drawn without a display."""

@@ -1,0 +1,1 @@
+"""Training on simulated worlds: presets, losses, one jitted step, the loop."""

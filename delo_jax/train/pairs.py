@@ -1,0 +1,71 @@
+"""Training pairs from worlds: random frames of one world, augmented, with a start for the fine stage. Host code."""
+
+import numpy as np
+
+from delo_jax.geometry import se3
+from delo_jax.preprocess import Scan
+from delo_jax.train.step import PairBatch
+from delo_jax.train.worlds import World
+
+MAX_IDENTITY_START_M = 2.5  # farther than this the identity is no start for a local method
+
+
+def _rotation_z(angle: float) -> np.ndarray:
+    return se3.exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))
+
+
+def _augment(scan: Scan, T: np.ndarray, mirror: bool, drop: float, rng: np.random.Generator) -> Scan:
+    """The scan seen from a turned (and mirrored) sensor, rows reshuffled, some points dropped."""
+    linear = T[:3, :3] @ np.diag([1.0, -1.0 if mirror else 1.0, 1.0])
+    order = rng.permutation(len(scan.mask))
+    keep = scan.mask[order] & (rng.random(len(order)) >= drop)
+    order = np.concatenate([order[keep], order[~keep]])
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    mask = np.arange(len(order)) < keep.sum()
+    index = rank[scan.keypoint_index].astype(np.int32)
+    return Scan(
+        (scan.points[order] @ linear.T).astype(np.float32),
+        (scan.normals[order] @ linear.T).astype(np.float32),
+        scan.features[order],
+        mask,
+        index,
+        scan.keypoint_mask & mask[index],
+    )
+
+
+def _start(T_true: np.ndarray, T_identity: np.ndarray, kind: int, rng: np.random.Generator) -> np.ndarray:
+    """Start of the fine stage: the identity (of the scans before augmentation), or the truth plus a disturbance."""
+    if kind == 0 and np.linalg.norm(T_true[:3, 3]) < MAX_IDENTITY_START_M:
+        return T_identity
+    size = np.exp(rng.uniform(np.log(0.03), np.log(1.2)))
+    xi = rng.normal(size=6)
+    xi[:3] *= size * np.radians(3.0) / np.sqrt(3.0)
+    xi[3:] *= size / np.sqrt(3.0)
+    return T_true @ se3.exp(xi)
+
+
+def random_pair(world: World, rng: np.random.Generator) -> PairBatch:
+    """One augmented pair (no batch axis) of two different frames of a world, in either order."""
+    source, target = rng.choice(len(world.Ts_world_lidar), 2, replace=False)
+    mirror, drop = rng.random() < 0.5, rng.choice([0.0, 0.0, 0.3])
+    yaw = rng.uniform(-np.pi, np.pi)
+    relative = rng.normal() * np.radians(8.0) if rng.random() < 0.5 else 0.0
+    A_source, A_target = _rotation_z(yaw), _rotation_z(yaw + relative)
+    M = np.diag([1.0, -1.0 if mirror else 1.0, 1.0, 1.0])
+    T = M @ se3.inverse(world.Ts_world_lidar[target]) @ world.Ts_world_lidar[source] @ M
+    T_true = A_target @ T @ se3.inverse(A_source)
+    T_init = _start(T_true, A_target @ se3.inverse(A_source), int(rng.integers(2)), rng)
+    scans = [
+        _augment(Scan(*(array[frame] for array in world.scans)), A, mirror, drop, rng)
+        for frame, A in ((source, A_source), (target, A_target))
+    ]
+    return PairBatch(scans[0], scans[1], T_true.astype(np.float32), T_init.astype(np.float32), np.array(rng.random() < 1 / 3))
+
+
+def make_batch(worlds: list[World], size: int, rng: np.random.Generator) -> PairBatch:
+    """`size` random pairs of random worlds, stacked."""
+    pairs = [random_pair(worlds[rng.integers(len(worlds))], rng) for _ in range(size)]
+    sources, targets, *rest = zip(*pairs, strict=True)
+    stack = [Scan(*(np.stack(arrays) for arrays in zip(*scans, strict=True))) for scans in (sources, targets)]
+    return PairBatch(*stack, *(np.stack(arrays) for arrays in rest))

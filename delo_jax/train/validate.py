@@ -1,0 +1,58 @@
+"""Errors on worlds that training never saw, through the very functions that inference uses."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from delo_jax import inference
+from delo_jax.geometry import se3
+from delo_jax.model import delo
+from delo_jax.preprocess import Scan
+from delo_jax.train.worlds import World
+
+GAPS = (1, 2, 3, 5)
+
+
+class GapErrors(NamedTuple):
+    """Registration from identity at one frame gap."""
+
+    gap: int
+    num_pairs: int
+    median_cm: float
+    p95_cm: float
+    median_deg: float
+    lost_share: float  # off by more than the config's limits
+    false_alarm_share: float  # of the pairs not lost: confidence below ok
+    missed_share: float  # of the lost pairs: confidence ok
+
+
+def validate(model: delo.Model, worlds: list[World]) -> list[GapErrors]:
+    """Errors at gaps 1, 2, 3 and 5 from the first frame of every world, no motion prior."""
+    rows = []
+    encodings = [[inference.encode(model, Scan(*(array[frame] for array in world.scans))) for frame in (0, *GAPS)] for world in worlds]
+    limits = model.cfg.status
+    for number, gap in enumerate(GAPS, start=1):
+        errors = []
+        for world, encoded in zip(worlds, encodings, strict=True):
+            result, confidence = jax.device_get(inference.solve(model, encoded[0], encoded[number], jnp.eye(4)))
+            T_true = se3.inverse(world.Ts_world_lidar[gap]) @ world.Ts_world_lidar[0]
+            error = se3.inverse(np.asarray(result.T_target_source, np.float64)) @ T_true
+            errors.append((np.linalg.norm(error[:3, 3]), se3.rotation_angle(error[:3, :3]), confidence))
+        translation, rotation, confidence = np.array(errors, np.float64).T
+        lost = ~((translation <= limits.lost_translation_m) & (rotation <= np.radians(limits.lost_rotation_deg)))
+        ok = confidence >= limits.ok_confidence
+        rows.append(
+            GapErrors(
+                gap,
+                len(errors),
+                100 * float(np.median(translation)),
+                100 * float(np.percentile(translation, 95)),
+                float(np.degrees(np.median(rotation))),
+                float(lost.mean()),
+                float((~ok & ~lost).sum() / max((~lost).sum(), 1)),
+                float((ok & lost).sum() / max(lost.sum(), 1)),
+            )
+        )
+    return rows

@@ -1,0 +1,87 @@
+"""Simulated worlds as training data: preprocessed scans with exact poses, made once and kept on disk."""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from delo_jax.config import PreprocessConfig, TrainConfig
+from delo_jax.preprocess import Scan, preprocess
+from delo_jax.sim import KINDS, simulate_clip
+
+VALIDATION_SEED = 1_000_000  # training seeds stay below
+SENSORS = ("hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl32e", "os1-128")
+
+
+class World(NamedTuple):
+    """Scans of one scene, stacked, and their poses."""
+
+    scans: Scan  # arrays with a leading frame axis
+    Ts_world_lidar: np.ndarray  # (f, 4, 4) float64
+
+
+def make_world(index: int, *, seed: int, num_frames: int, cfg: PreprocessConfig) -> World:
+    """World number `index`: the scene kinds take turns, one clip in four is of another sensor than the HDL-64E.
+
+    Args:
+        index: number of the world; with `seed` it fixes everything.
+        seed: base seed.
+        num_frames: scans, 0.1 s apart.
+        cfg: preprocessing of the scans.
+    """
+    kind = KINDS[index % len(KINDS)]
+    sensor = SENSORS[(index // len(KINDS)) % len(SENSORS)]
+    clip = simulate_clip(kind, seed + index, num_frames=num_frames, sensor=sensor)
+    with ThreadPoolExecutor(2) as pool:
+        scans = list(pool.map(lambda scan: preprocess(scan.points, cfg), clip))
+    stacked = Scan(*(np.stack(arrays) for arrays in zip(*scans, strict=True)))
+    return World(stacked, np.stack([scan.T_world_lidar for scan in clip]))
+
+
+def worlds(cfg: TrainConfig, folder: Path, *, validation: bool, on_world: Callable[[], None] = lambda: None) -> Iterator[World]:
+    """All worlds of a run, read from `folder` or simulated and written there; an interrupted run goes on where it was.
+
+    Args:
+        cfg: number of scenes, frames, seed and preprocessing.
+        folder: store; worlds of another preprocessing do not get mixed up, since the file name holds its fingerprint.
+        validation: the held-out worlds instead of the training worlds.
+        on_world: called after each world, for progress.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    name, count, seed = ("validation", cfg.num_validation_scenes, VALIDATION_SEED) if validation else ("train", cfg.num_scenes, 0)
+    fingerprint = _fingerprint(cfg)
+    for index in range(count):
+        path = folder / f"{name}_{fingerprint}_{index:05d}.npz"
+        if not path.exists():
+            world = make_world(index, seed=seed + cfg.seed * 10_000, num_frames=cfg.num_frames, cfg=cfg.model.preprocess)
+            _write(path, world)
+        yield _read(path)
+        on_world()
+
+
+def _fingerprint(cfg: TrainConfig) -> str:
+    text = json.dumps([asdict(cfg.model.preprocess), cfg.num_frames, cfg.seed])
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def _write(path: Path, world: World) -> None:
+    part = path.with_suffix(".part")
+    halves = {name: array.astype(np.float16) if name in ("normals", "features") else array for name, array in world.scans._asdict().items()}
+    with part.open("wb") as file:
+        np.savez(file, **halves, Ts_world_lidar=world.Ts_world_lidar)
+    os.replace(part, path)
+
+
+def _read(path: Path) -> World:
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    Ts = arrays.pop("Ts_world_lidar")
+    for name in ("normals", "features"):
+        arrays[name] = arrays[name].astype(np.float32)
+    return World(Scan(**arrays), Ts)

@@ -1,0 +1,39 @@
+"""Covariance of a pose from its evidence."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from delo_jax.config import StatusConfig
+
+
+class Uncertainty(NamedTuple):
+    """Variances per degree of freedom and their covariance, order [omega, v], rad^2 and m^2, right perturbation."""
+
+    aleatoric: np.ndarray  # (6,) noise of the data
+    epistemic: np.ndarray  # (6,) doubt of the model
+    covariance: np.ndarray  # (6, 6)
+
+
+def from_evidence(nu: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> Uncertainty:
+    """Moments of the normal-inverse-gamma prediction; the covariance is the diagonal of their sum, not calibrated.
+
+    Args:
+        nu, alpha, beta: (6,) each, beta in rad^2 and m^2.
+    """
+    aleatoric = beta / (alpha - 1.0)
+    epistemic = aleatoric / nu
+    return Uncertainty(aleatoric, epistemic, np.diag(aleatoric + epistemic))
+
+
+def unknown(cfg: StatusConfig) -> Uncertainty:
+    """What is known of a pose that nobody measured: the configured standard deviations, all of them epistemic."""
+    sigma = np.repeat([np.radians(cfg.unknown_rotation_deg), cfg.unknown_translation_m], 3)
+    return Uncertainty(np.zeros(6), sigma**2, np.diag(sigma**2))
+
+
+def widen(known: Uncertainty, cfg: StatusConfig) -> Uncertainty:
+    """The same uncertainty, but nowhere smaller than that of a pose nobody measured."""
+    floor = unknown(cfg).epistemic
+    epistemic = np.maximum(known.epistemic, floor - known.aleatoric)
+    return Uncertainty(known.aleatoric, epistemic, np.diag(known.aleatoric + epistemic))

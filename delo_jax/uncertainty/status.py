@@ -1,0 +1,51 @@
+"""Health status of a pair."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from delo_jax.config import StatusConfig
+
+STATUSES = ("ok", "low_confidence", "degenerate", "rejected")
+
+
+class Health(NamedTuple):
+    """Status, why, and how sure the network is that the pair is not lost."""
+
+    status: str  # one of STATUSES
+    reason: str  # empty when ok
+    confidence: float  # in [0, 1]
+
+
+def judge(
+    *,
+    num_points: tuple[int, int],
+    finite: bool,
+    confidence: float,
+    observability: np.ndarray,
+    weakest_axis: np.ndarray,
+    cfg: StatusConfig,
+) -> Health:
+    """Status of a solved pair; the worst that applies.
+
+    Args:
+        num_points: usable points of source and target.
+        finite: whether the solver returned numbers.
+        confidence: probability that the pair is not lost.
+        observability: (3,) ascending shares of the surface normals per principal direction.
+        weakest_axis: (3,) unit direction in the target frame that is seen worst.
+        cfg: thresholds.
+    """
+    if min(num_points) < cfg.min_points:
+        which = "source" if num_points[0] < cfg.min_points else "target"
+        return Health("rejected", f"{which} has {min(num_points)} usable points, fewer than {cfg.min_points}", 0.0)
+    if not finite:
+        return Health("rejected", "the solver returned no finite pose", 0.0)
+    if confidence < cfg.rejected_confidence:
+        return Health("rejected", f"confidence {confidence:.2f} is below {cfg.rejected_confidence:g}", confidence)
+    if observability[0] < cfg.min_observability:
+        axis = "forward lateral vertical".split()[int(np.argmax(np.abs(weakest_axis)))]
+        return Health("degenerate", f"hardly any surface holds the {axis} direction ({observability[0]:.4f})", confidence)
+    if confidence < cfg.ok_confidence:
+        return Health("low_confidence", f"confidence {confidence:.2f} is below {cfg.ok_confidence:g}", confidence)
+    return Health("ok", "", confidence)

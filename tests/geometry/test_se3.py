@@ -1,0 +1,185 @@
+"""Poses, twists and their covariances."""
+
+import gtsam
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis.extra.numpy import arrays
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from delo_jax.geometry import se3
+from tests.oracles.agreement import assert_gradient_is_the_slope, assert_transforms_agree
+from tests.oracles.registration import hat, numeric_jacobian
+
+ANGLES = [0.0, 1e-12, 1e-7, 1e-4, 0.031, 0.032, 0.5, 3.0, np.pi - 1e-4, np.pi - 1e-9]
+
+jitted_exp, jitted_log = jax.jit(se3.exp), jax.jit(se3.log)
+
+
+def twists(angle, count=4, seed=0):
+    rng = np.random.default_rng(seed)
+    axes = rng.normal(size=(count, 3))
+    return np.hstack([angle * axes / np.linalg.norm(axes, axis=1, keepdims=True), 10 * rng.normal(size=(count, 3))])
+
+
+def random_pose(seed):
+    return gtsam.Pose3.Expmap(np.random.default_rng(seed).normal(size=6)).matrix()
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_exp_is_the_matrix_exponential(angle):
+    """Oracle: scipy.linalg.expm of the 4x4 matrix of the twist, and gtsam Pose3.Expmap for the order [omega, v]."""
+    xi = twists(angle)
+    T = se3.exp(xi)
+    assert T.dtype == np.float64
+    np.testing.assert_allclose(T, [expm(hat(x)) for x in xi], atol=5e-13)
+    np.testing.assert_allclose(T, [gtsam.Pose3.Expmap(x).matrix() for x in xi], atol=1e-11)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_log_inverts_the_matrix_exponential_up_to_pi(angle):
+    """Oracle: the twist that scipy's expm was given; no angle below pi is special, that of a half turn included."""
+    xi = twists(angle)
+    np.testing.assert_allclose(se3.log(np.stack([expm(hat(x)) for x in xi])), xi, atol=1e-11)
+
+
+def test_log_of_half_turns():
+    """Oracle: scipy Rotation; at pi the axis is known up to its sign."""
+    for axis in [*np.eye(3), np.array([0.6, 0.0, -0.8]), np.ones(3) / np.sqrt(3)]:
+        T = np.eye(4)
+        T[:3, :3] = 2 * np.outer(axis, axis) - np.eye(3)
+        omega = se3.log(T)[:3]
+        np.testing.assert_allclose(Rotation.from_rotvec(omega).as_matrix(), T[:3, :3], atol=1e-14)
+        assert np.linalg.norm(omega) == pytest.approx(np.pi)
+
+
+@given(arrays(np.float64, 6, elements=st.floats(-1.5, 1.5)))
+def test_float32_on_jax_follows_jaxlie(xi):
+    """Oracle: jaxlie, translation first, evaluated in the same float32."""
+    T = jitted_exp(jnp.asarray(xi, jnp.float32))
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        other = jaxlie.SE3.exp(jnp.asarray(np.r_[xi[3:], xi[:3]], jnp.float32))
+        np.testing.assert_allclose(T, other.as_matrix(), atol=2e-6)
+    np.testing.assert_allclose(jitted_log(T), xi, atol=1e-5)
+
+
+@pytest.mark.parametrize("angle_deg", [1e-4, 1e-3, 0.02])
+def test_float32_keeps_tiny_angles(angle_deg):
+    """Oracle: the angle put in; arccos of the trace would return 0 or 0.02 deg."""
+    xi = twists(np.deg2rad(angle_deg)).astype(np.float32)
+    T = jitted_exp(jnp.asarray(xi))
+    np.testing.assert_allclose(np.rad2deg(jax.jit(se3.rotation_angle)(T[:, :3, :3])), angle_deg, rtol=2e-3)
+    np.testing.assert_allclose(jitted_log(T)[:, :3], xi[:, :3], rtol=2e-3, atol=1e-9)
+
+
+def test_numpy_and_jax_are_one_implementation():
+    """Oracle: the NumPy side, tested above, against JAX in x64."""
+    xi = np.concatenate([twists(angle) for angle in ANGLES])
+    with jax.enable_x64(True):
+        T = jitted_exp(jnp.asarray(xi))
+        np.testing.assert_allclose(T, se3.exp(xi), atol=1e-14)
+        np.testing.assert_allclose(jitted_log(T), xi, atol=1e-11)
+        pose = se3.pose6(T[0])
+        np.testing.assert_allclose(pose, se3.pose6(se3.exp(xi)[0]), atol=1e-14)
+        np.testing.assert_allclose(se3.from_pose6(pose), T[0], atol=1e-14)
+        np.testing.assert_allclose(se3.adjoint(T), se3.adjoint(se3.exp(xi)), atol=1e-12)
+
+
+def test_jacobian_at_the_identity_and_near_it():
+    """Oracle: central differences of scipy's expm; at zero autodiff of a naive norm is NaN."""
+    with jax.enable_x64(True):
+        jacobian = jax.jit(jax.jacfwd(se3.exp))
+        for xi in (np.zeros(6), np.array([1e-9, 0, 0, 1.0, 2.0, 3.0]), twists(2.5)[0]):
+            expected = numeric_jacobian(lambda x: expm(hat(x)).ravel(), xi, step=1e-5)
+            np.testing.assert_allclose(jacobian(jnp.asarray(xi)).reshape(16, 6), expected, atol=1e-8)
+        chain = jax.jit(jax.jacrev(lambda x: se3.log(se3.exp(x))))
+        for xi in (np.zeros(6), twists(1e-9)[0], twists(2.5)[0]):  # the log of the exp is the identity map
+            np.testing.assert_allclose(chain(jnp.asarray(xi)), np.eye(6), atol=1e-9)
+
+
+def test_other_gradients_are_the_slopes():
+    """Oracle: central differences in x64."""
+    with jax.enable_x64(True):
+        probe = jnp.arange(16.0).reshape(4, 4)
+
+        def loss(xi):
+            T = se3.exp(xi)
+            points = se3.transform(T, probe[:, :3])
+            loops = se3.from_pose6(2.0 * se3.pose6(se3.inverse(T)))
+            return jnp.sum(points**2) + jnp.sum(probe * loops) + se3.rotation_angle(T[:3, :3]) + jnp.sum(se3.adjoint(T) ** 3)
+
+        assert_gradient_is_the_slope(loss, [twists(0.8)[0] / 3])
+        at_identity = jax.grad(lambda xi: se3.rotation_angle(se3.exp(xi)[:3, :3]))(jnp.zeros(6))
+        np.testing.assert_array_equal(at_identity, np.zeros(6))
+
+
+def test_exp_and_log_under_jit_and_vmap():
+    """Oracle: the same function, one pose at a time, not compiled."""
+    xi = jnp.asarray(twists(0.7), jnp.float32)
+    assert_transforms_agree(lambda x: (se3.exp(x), se3.log(se3.exp(x)), se3.inverse(se3.exp(x))), xi)
+    np.testing.assert_allclose(se3.exp(xi.reshape(2, 2, 6)).reshape(4, 4, 4), se3.exp(xi), atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_group_operations(seed):
+    """Oracle: gtsam Pose3 (inverse, AdjointMap, transformFrom), NumPy cross product."""
+    rng = np.random.default_rng(seed)
+    T, points = random_pose(seed), rng.normal(size=(5, 3))
+    pose = gtsam.Pose3(T)
+    np.testing.assert_allclose(se3.inverse(T), pose.inverse().matrix(), atol=1e-13)
+    np.testing.assert_allclose(se3.adjoint(T), pose.AdjointMap(), atol=1e-13)
+    np.testing.assert_allclose(se3.transform(T, points), pose.transformFrom(points.T).T, atol=1e-13)
+    np.testing.assert_allclose(se3.skew(points) @ points[0], np.cross(points, points[:1]), atol=1e-14)
+    np.testing.assert_allclose(se3.rotation_angle(T[:3, :3]), Rotation.from_matrix(T[:3, :3]).magnitude(), atol=1e-13)
+    assert se3.transform(T, points[:0]).shape == (0, 3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pose6_is_intrinsic_xyz(seed):
+    """Oracle: scipy Rotation, upper-case "XYZ"."""
+    T = random_pose(seed)
+    pose = se3.pose6(T)
+    np.testing.assert_allclose(pose, np.r_[Rotation.from_matrix(T[:3, :3]).as_euler("XYZ"), T[:3, 3]], atol=1e-13)
+    np.testing.assert_allclose(se3.from_pose6(pose), T, atol=1e-13)
+
+
+def test_covariances_follow_the_chain_rule():
+    """Oracle: central differences of gtsam's compose, inverse and Logmap; right perturbations."""
+    rng = np.random.default_rng(0)
+    A, B = gtsam.Pose3(random_pose(1)), gtsam.Pose3(random_pose(2))
+    covariance_a, covariance_b = (M @ M.T for M in rng.normal(size=(2, 6, 6)))
+
+    def composed(x):
+        moved = A.compose(gtsam.Pose3.Expmap(x[:6])).compose(B).compose(gtsam.Pose3.Expmap(x[6:]))
+        return gtsam.Pose3.Logmap(A.compose(B).between(moved))
+
+    J = numeric_jacobian(composed, np.zeros(12))
+    expected = J[:, :6] @ covariance_a @ J[:, :6].T + J[:, 6:] @ covariance_b @ J[:, 6:].T
+    np.testing.assert_allclose(se3.compose_covariance(covariance_a, covariance_b, B.matrix()), expected, rtol=1e-6, atol=1e-6)
+
+    J = numeric_jacobian(lambda x: gtsam.Pose3.Logmap(A.compose(A.compose(gtsam.Pose3.Expmap(x)).inverse())), np.zeros(6))
+    np.testing.assert_allclose(se3.invert_covariance(covariance_a, A.matrix()), J @ covariance_a @ J.T, rtol=1e-6, atol=1e-6)
+
+
+def test_ros_order():
+    """Oracle: the layout in geometry_msgs/PoseWithCovariance, written out for two entries."""
+    covariance = np.arange(36.0).reshape(6, 6)
+    ros = se3.to_ros_covariance(covariance)
+    assert ros.shape == (36,)
+    assert ros[0] == covariance[3, 3]  # x, x
+    assert ros[1 * 6 + 5] == covariance[4, 2]  # y, yaw
+    np.testing.assert_array_equal(se3.to_ros_covariance(jnp.asarray(covariance)), ros)
+
+
+def test_interpolate_is_a_screw_motion():
+    """Oracle: gtsam Expmap of a share of its Logmap; the ends are the identity and T."""
+    T, fractions = random_pose(0), np.array([0.0, 0.25, 1.0, 1.5])
+    expected = [gtsam.Pose3.Expmap(s * gtsam.Pose3.Logmap(gtsam.Pose3(T))).matrix() for s in fractions]
+    np.testing.assert_allclose(se3.interpolate(T, fractions), expected, atol=1e-12)
+    np.testing.assert_allclose(se3.interpolate(T, 0.25), expected[1], atol=1e-12)
+    np.testing.assert_allclose(se3.interpolate(jnp.asarray(T, jnp.float32), jnp.asarray(fractions, jnp.float32)), expected, atol=1e-5)
