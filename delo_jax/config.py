@@ -97,7 +97,7 @@ class FineConfig:
 
     def __post_init__(self):
         require(self.num_points >= 16, "fine.num_points", "at least 16", self.num_points)
-        require(self.num_iters >= 1, "fine.num_iters", "at least 1", self.num_iters)
+        require(self.num_iters >= 2, "fine.num_iters", "at least 2: one per hypothesis, one after the choice", self.num_iters)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -155,6 +155,10 @@ class DeloConfig:
     status: StatusConfig = StatusConfig()
     """Health status."""
 
+    def __post_init__(self):
+        fits = 0 < self.coarse.num_neighbors <= self.preprocess.num_keypoints
+        require(fits, "coarse.num_neighbors", "1 to preprocess.num_keypoints", self.coarse.num_neighbors)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainConfig:
@@ -188,8 +192,8 @@ class TrainConfig:
     """Weight of the matching loss; 0 switches it off."""
     fine_weight: float = 1.0
     """Weight of the pose loss; 0 switches it off."""
-    evidence_weight: float = 0.1
-    """Weight of the evidence loss; 0 switches it off."""
+    evidence_weight: float = 1.0
+    """Weight of the evidence loss, learned after the other two; 0 switches it off."""
     regulariser_weight: float = 0.01
     """lambda_R of the evidence loss."""
     validate_every: int = 250
@@ -198,7 +202,10 @@ class TrainConfig:
     def __post_init__(self):
         require(self.num_frames >= 2, "num_frames", "at least 2", self.num_frames)
         require(self.num_scenes >= 1, "num_scenes", "at least 1", self.num_scenes)
+        require(self.num_validation_scenes >= 1, "num_validation_scenes", "at least 1", self.num_validation_scenes)
         require(self.batch_size >= 1, "batch_size", "at least 1", self.batch_size)
+        require(1 <= self.num_iters <= 4, "num_iters", "1 to 4, as many as the loss has weights", self.num_iters)
+        require(self.validate_every >= 1, "validate_every", "at least 1", self.validate_every)
 
 
 def from_dict(cls: type[T], table: Mapping[str, Any], where: str = "config") -> T:
@@ -235,7 +242,7 @@ def load(cls: type[T], path: Path) -> T:
         ConfigError: unreadable file, TOML syntax, unknown key, wrong type or range.
     """
     try:
-        table = tomllib.loads(Path(path).read_text())
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: expected a readable TOML file, got {error.strerror}; check the path") from error
     except ValueError as error:
@@ -262,5 +269,5 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str | Path):
-        return json.dumps(str(value), ensure_ascii=False)  # the escapes of JSON are TOML's too
+        return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")  # the escapes of JSON are TOML's, which has one more
     return repr(value)

@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 from delo_jax.errors import ScanError
 from delo_jax.geometry import se3
 from delo_jax.model import delo
-from delo_jax.ops import evidence
 from delo_jax.preprocess import preprocess
 from delo_jax.uncertainty import covariance, status
 
 encode = jax.jit(delo.encode)
+solve = jax.jit(delo.solve)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,22 +60,17 @@ class EncodedScan(NamedTuple):
     num_points: int  # usable points
 
 
-@jax.jit
-def solve(model: delo.Model, source: delo.Encoding, target: delo.Encoding, T_init: jax.Array) -> tuple[delo.Registration, jax.Array]:
-    """Registration of a pair and the probability that it is not lost."""
-    registration = delo.solve(model, source, target, T_init)
-    limits = model.cfg.status
-    bound = jnp.repeat(jnp.array([jnp.radians(limits.lost_rotation_deg), limits.lost_translation_m]), 3)
-    return registration, jnp.prod(evidence.interval_probability(registration.nig, bound))
-
-
 def prepare(params: delo.Model, points: ArrayLike) -> EncodedScan:
     """Preprocess and encode a scan.
 
     Raises:
         ScanError: not an array of numbers of shape (n, 3).
     """
-    scan = preprocess(np.asarray(points), params.cfg.preprocess)
+    try:
+        array = np.asarray(points)
+    except ValueError as error:
+        raise ScanError(f"points: expected an array of shape (n, 3) in metres, got rows of different lengths: {error}") from error
+    scan = preprocess(array, params.cfg.preprocess)
     return EncodedScan(encode(params, scan), int(scan.mask.sum()))
 
 
@@ -83,12 +78,11 @@ def align(params: delo.Model, source: EncodedScan, target: EncodedScan, T_target
     """Estimate of a pair of encoded scans from a start; see `odometry`."""
     limits = params.cfg.status
     start = np.asarray(T_target_source_init, np.float64)
-    solved = jax.device_get(solve(params, source.encoding, target.encoding, jnp.asarray(start, jnp.float32)))
-    result, confidence = solved
+    result = jax.device_get(solve(params, source.encoding, target.encoding, jnp.asarray(start, jnp.float32)))
     health = status.judge(
         num_points=(source.num_points, target.num_points),
         finite=bool(result.finite),
-        confidence=float(np.nan_to_num(confidence)),
+        confidence=float(np.nan_to_num(result.confidence)),
         observability=result.observability,
         weakest_axis=result.weakest_axis,
         cfg=limits,
@@ -137,9 +131,14 @@ def check_pose(T: ArrayLike) -> np.ndarray:
     Raises:
         ScanError: wrong shape, or not a rigid transformation.
     """
-    pose = np.asarray(T, np.float64)
+    try:
+        pose = np.asarray(T, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ScanError(f"T_target_source_init: expected a (4, 4) pose, got {error}") from error
     if pose.shape != (4, 4):
         raise ScanError(f"T_target_source_init: expected a (4, 4) pose, got shape {pose.shape}")
-    if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-4) or not np.isfinite(pose).all():
-        raise ScanError("T_target_source_init: expected a rigid transformation, got a matrix whose rotation is not orthonormal")
+    R = pose[:3, :3]
+    rigid = np.isfinite(pose).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-4) and np.linalg.det(R) > 0
+    if not rigid or not np.allclose(pose[3], [0, 0, 0, 1]):
+        raise ScanError("T_target_source_init: expected a rigid transformation, got a rotation that is none or a last row not 0 0 0 1")
     return pose

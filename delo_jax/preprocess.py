@@ -38,7 +38,8 @@ def check_points(points: np.ndarray, name: str = "points") -> np.ndarray:
         raise ScanError(f"{name}: expected an array of shape (n, 3) in metres, got shape {points.shape}{hint}")
     if points.dtype.kind not in "fiu":
         raise ScanError(f"{name}: expected numbers, got dtype {points.dtype}; convert to float32")
-    return points.astype(np.float32, copy=False)
+    with np.errstate(over="ignore"):  # beyond float32 is infinite, and dropped as such
+        return points.astype(np.float32, copy=False)
 
 
 def preprocess(points: np.ndarray, cfg: PreprocessConfig) -> Scan:
@@ -113,10 +114,10 @@ def _describe(cloud: np.ndarray, rows: np.ndarray, cfg: PreprocessConfig):
     distances, index = tree.query(points, k=k, distance_upper_bound=2.0, workers=2)
     near = distances <= radius[:, None]
     center, normal, eigenvalues = plane_fit(cloud[np.where(near, index, rows[:, None])], near)
-    normal = np.where(np.einsum("ij,ij->i", normal, points)[:, None] > 0, -normal, normal)
     planar = eigenvalues[:, 0] < 0.1 * eigenvalues[:, 1]
     offset = np.einsum("ij,ij->i", points - center, normal)
     projected = points - np.where(planar, offset, 0.0)[:, None] * normal
+    normal = np.where(np.einsum("ij,ij->i", normal, projected)[:, None] > 0, -normal, normal)
     count = near.sum(axis=1)
     mean_distance = np.where(near, distances, 0.0).sum(axis=1) / np.maximum(count, 1)
     features = _features(projected, normal, eigenvalues, ranges, count / cfg.num_neighbors, mean_distance)

@@ -51,6 +51,8 @@ def read_card(name: str | Path) -> dict[str, Any]:
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         got = card.get("format") if isinstance(card, dict) else type(card).__name__
         raise WeightsError(f"{path}: expected format {FORMAT}, got {got}; update delo-jax or the weights")
+    if not isinstance(card.get("config"), dict):
+        raise WeightsError(f"{path}: expected a card with a config, got {card.get('config')!r}; restore the file")
     return card
 
 
@@ -73,11 +75,13 @@ def load(name: str | Path = "delo-base") -> delo.Model:
     template = jax.eval_shape(lambda: delo.init(cfg, jax.random.key(0))).variables
     leaves, tree = jax.tree_util.tree_flatten_with_path(template)
     names = [_name(key_path) for key_path, _ in leaves]
-    expected = {name: leaf.shape for name, (_, leaf) in zip(names, leaves, strict=True)}
-    got = {name: array.shape for name, array in tensors.items()}
+    expected = {name: (leaf.shape, leaf.dtype) for name, (_, leaf) in zip(names, leaves, strict=True)}
+    got = {name: (array.shape, array.dtype) for name, array in tensors.items()}
     if got != expected:
         wrong = sorted(name for name in expected.keys() | got.keys() if expected.get(name) != got.get(name))
-        raise WeightsError(f"{path}: expected the arrays of preset {cfg.name!r}, got other shapes at {', '.join(wrong[:3])}; use matching weights")
+        raise WeightsError(
+            f"{path}: expected the arrays of preset {cfg.name!r}, got other shapes or types at {', '.join(wrong[:3])}; use matching weights"
+        )
     return delo.Model(jax.tree_util.tree_unflatten(tree, [jnp.asarray(tensors[name]) for name in names]), cfg)
 
 

@@ -28,9 +28,9 @@ STRICT_DTYPE_FOLDERS = tuple(TESTS / name for name in ("geometry", "ops", "sim")
 def pytest_collection_modifyitems(items):
     """Adds the skips of `data` and `gpu` tests, each with one sentence that says what to set."""
     for item in items:
-        if "data" in item.keywords and not os.environ.get("DELO_DATA"):
+        if item.get_closest_marker("data") and not os.environ.get("DELO_DATA"):
             item.add_marker(pytest.mark.skip(reason="needs real scans: set DELO_DATA to a KITTI-like tree"))
-        if "gpu" in item.keywords and not os.environ.get("DELO_TEST_GPU"):
+        if item.get_closest_marker("gpu") and not os.environ.get("DELO_TEST_GPU"):
             item.add_marker(pytest.mark.skip(reason="needs an accelerator: set DELO_TEST_GPU=1"))
 
 
@@ -38,7 +38,7 @@ def pytest_collection_modifyitems(items):
 def pytest_runtest_makereport(item):
     """Turns a skipped `data` test into a failure where the data has to be there."""
     report = yield
-    if report.skipped and not hasattr(report, "wasxfail") and "data" in item.keywords and os.environ.get("DELO_REQUIRE_DATA"):
+    if report.skipped and not hasattr(report, "wasxfail") and item.get_closest_marker("data") and os.environ.get("DELO_REQUIRE_DATA"):
         report.outcome, report.longrepr = "failed", f"{item.nodeid} skipped although DELO_REQUIRE_DATA is set: {report.longrepr}"
     return report
 

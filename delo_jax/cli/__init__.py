@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from delo_jax import __doc__ as summary
+import delo_jax
 from delo_jax.cli.command import Command
 from delo_jax.cli.demo import Demo
 from delo_jax.cli.doctor import Doctor
@@ -48,9 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parse(argv: Sequence[str]) -> Command:
-    description = (summary or "").splitlines()[0]
+    description = (delo_jax.__doc__ or "").splitlines()[0]
     return tyro.extras.subcommand_cli_from_dict(
-        dict(COMMANDS), prog="delo", description=description, args=list(argv), config=(tyro.conf.FlagCreatePairsOff,)
+        dict(COMMANDS), prog="delo", description=description, args=list(argv), config=(tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
     )
 
 

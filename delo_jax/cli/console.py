@@ -1,12 +1,14 @@
 """What commands show: progress on stderr, tables on stdout, Ctrl-C between two scans."""
 
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
@@ -35,7 +37,13 @@ class RateColumn(ProgressColumn):
 def progress(unit: str = "scans") -> Progress:
     """A bar with count, rate and time left; on stderr, so that stdout holds results alone."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), RateColumn(unit), TimeRemainingColumn()
-    return Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True))
+    note = TextColumn("{task.fields[note]}")
+    return Progress(*columns, note, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty())  # a table in a file stays there
+
+
+def working(what: str) -> Status:
+    """A sign of life on stderr while something runs that has no steps to count; a context manager."""
+    return Console(stderr=True).status(what)
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[int] = ()) -> None:

@@ -10,6 +10,7 @@ import tyro
 from delo_jax.cli.command import Command
 
 if TYPE_CHECKING:
+    from delo_jax.cli.tracking import Job, Result
     from delo_jax.data.dataset import Dataset
 
 DESKEW_WORDS = {
@@ -36,8 +37,8 @@ class Run(Command):
     """Released weights by name, or a .safetensors file."""
     deskew: Literal["auto", "on", "off"] = "auto"
     """Undo the motion within a sweep. auto: where points carry times; on: also by azimuth, for scans as measured."""
-    elevation_correction: bool = True
-    """The 0.205 deg that KITTI's scans need; other scans are never changed."""
+    no_elevation_correction: bool = False
+    """Leave out the 0.205 deg that KITTI's scans need; other scans are never changed."""
 
     def run(self) -> int:
         """Tracks all scans and prints a summary."""
@@ -45,7 +46,7 @@ class Run(Command):
         from delo_jax.data.dataset import open_dataset
 
         dataset = open_dataset(
-            self.path, sequence=self.sequence, elevation_correction=self.elevation_correction, azimuth_times=self.deskew == "on"
+            self.path, sequence=self.sequence, elevation_correction=not self.no_elevation_correction, azimuth_times=self.deskew == "on"
         )
         folder = new_folder(self.out, dataset.name)
         deskew = "off" if self.deskew == "off" else DESKEW_WORDS[dataset.point_times]
@@ -74,7 +75,7 @@ class Run(Command):
         }
 
 
-def conclude(job: Any, result: Any) -> int:
+def conclude(job: "Job", result: "Result") -> int:
     """Prints the end of a run and returns its exit code."""
     from delo_jax.cli.console import print_summary
     from delo_jax.cli.summary import rejected_lines, run_rows

@@ -34,13 +34,10 @@ class Simulate(Command):
     rolling_shutter: bool = False
     """Points as measured by the moving sensor rather than motion-compensated."""
 
-    def __post_init__(self) -> None:
-        """Refuses what cannot be simulated."""
-        require(self.num_scans >= 1, "num_scans", "at least 1", self.num_scans)
-        require(self.seed >= 0, "seed", "0 or more", self.seed)
-
     def run(self) -> int:
         """Writes the tree and prints how to go on."""
+        require(self.num_scans >= 1, "num_scans", "at least 1", self.num_scans)
+        require(self.seed >= 0, "seed", "0 or more", self.seed)
         from delo_jax.cli.console import Row, interruptible, print_summary, progress
         from delo_jax.data.writers import KittiTreeWriter
         from delo_jax.sim import simulate_drive

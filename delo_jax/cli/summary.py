@@ -78,7 +78,7 @@ def rejected_lines(result: Result, names: Sequence[object], limit: int = 5) -> l
     rejected = [record for record in result.trajectory.records if record.status == "rejected"]
     lines = []
     for record in rejected[:limit]:
-        name = str(names[record.index])
+        name = str(names[record.number])
         lines.append(record.reason if record.reason.startswith(name) else f"{name}: {record.reason}")
     more = len(rejected) - limit
     return lines + ([f"and {more} more; frames.csv has them all"] if more > 0 else [])

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -18,18 +18,19 @@ import numpy as np
 import delo_jax
 from delo_jax import inference, weights
 from delo_jax.cli.command import Command
-from delo_jax.cli.console import interruptible, progress
+from delo_jax.cli.console import interruptible, progress, working
 from delo_jax.config import DeloConfig, to_toml
 from delo_jax.data.fields import RawScan
 from delo_jax.errors import ConfigError, ScanError
 from delo_jax.model.delo import Model
-from delo_jax.pipeline.lidar_odometry import Frame, LidarOdometry
+from delo_jax.pipeline.lidar_odometry import LidarOdometry
 from delo_jax.pipeline.trajectory import RunWriter, Trajectory
 from delo_jax.report.figures import trajectory_figure
 
 STAGES = ("prepare", "solve")
 
 
+@runtime_checkable
 class Scans(Protocol):
     """Scans in order, taken one by one: a `Dataset`, or a drive that is simulated on the way."""
 
@@ -121,7 +122,8 @@ def track(job: Job) -> Result:
         DeloError: weights that cannot be used, or a folder that cannot be written.
     """
     params, card = weights.load(job.weights), weights.read_card(job.weights)
-    compile_s = compile_model(params)
+    with working("compiling"):
+        compile_s = compile_model(params)
     print(f"compiled in {compile_s:.1f} s")
     facts = _facts(job, card, compile_s)
     try:
@@ -152,10 +154,7 @@ def _loop(job: Job, odometry: LidarOdometry, writer: RunWriter) -> tuple[list[fl
             begin = time.perf_counter()
             scan = _acquire(job.source, index)
             acquired.append(time.perf_counter() - begin)
-            if isinstance(scan, str):
-                frame = odometry.reject(scan, stamp_ns)
-            else:
-                frame = odometry.register(scan.points, stamp_ns, scan.times)
+            frame = odometry.reject(scan, stamp_ns) if isinstance(scan, str) else odometry.register(scan.points, stamp_ns, scan.times)
             writer.append(frame._replace(timing={job.stage: acquired[-1], **frame.timing}))
             bar.advance(task)
     return acquired, False
@@ -178,7 +177,7 @@ def _result(job: Job, trajectory: Trajectory, acquired: list[float], compile_s: 
 def percentiles_ms(seconds: np.ndarray) -> tuple[float, float] | None:
     """Median and 95th percentile [ms] of the frames that went through a stage; None where none did."""
     known = seconds[np.isfinite(seconds)]
-    return (1e3 * float(np.median(known)), 1e3 * float(np.percentile(known, 95))) if len(known) else None
+    return (round(1e3 * float(np.median(known)), 3), round(1e3 * float(np.percentile(known, 95)), 3)) if len(known) else None
 
 
 def _finish(job: Job, result: Result, facts: dict[str, Any]) -> None:

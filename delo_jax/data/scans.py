@@ -48,14 +48,14 @@ def parse_bin(data: bytes) -> RawScan:
 
     The file does not say how many columns it has. We take the count that keeps unlike quantities apart: for the true count each column
     is one quantity, for a wrong one it is a mixture, whose log variance is larger (Jensen). Counts within the noise of the best are
-    ties, and go to the first of 4, 5, 3, 6 (six columns have to be clearly better than three). Files of less than 60 values are
-    decided by size alone, in the same order.
+    ties, and go to the first of 4, 5, 3, 6 of which the file is whole rows (six columns have to be clearly better than three). In
+    files of less than 60 values all counts are ties.
 
     Raises:
         ScanError: empty, not whole rows of that count, or values that are no coordinates in metres.
     """
     values = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
-    columns = _num_columns(values)
+    columns = _num_columns(values, len(data))
     if len(data) % (4 * columns):
         raise ScanError(
             f"expected whole points of {columns} float32 values ({4 * columns} bytes each), got {len(data)} bytes; "
@@ -71,16 +71,20 @@ def parse_bin(data: bytes) -> RawScan:
     return RawScan(points, None)
 
 
-def _num_columns(values):
-    if len(values) < _BLOCK:
-        return next((columns for columns in BIN_COLUMNS if len(values) % columns == 0), BIN_COLUMNS[0])
+def _num_columns(values, num_bytes):
+    likely = BIN_COLUMNS if len(values) < _BLOCK else _likely_columns(values)
+    return next((columns for columns in likely if num_bytes % (4 * columns) == 0), likely[0])
+
+
+def _likely_columns(values):
+    """Column counts whose score is within the noise of the best, in order of preference."""
     blocks = values[: len(values) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)
     blocks = blocks[:: max(1, len(blocks) // 1000)]
     sample = np.clip(np.nan_to_num(blocks, nan=0.0), -_FARTHEST, _FARTHEST)
     scores = [float(np.mean(np.log(sample.reshape(-1, columns).var(axis=0, dtype=np.float64) + 1e-6))) for columns in BIN_COLUMNS]
     scores[BIN_COLUMNS.index(6)] += _SIX_COLUMN_HANDICAP
     noise = max(0.1, 4.0 / np.sqrt(sample.size / 4))  # of a log variance over that many rows
-    return next(columns for columns, score in zip(BIN_COLUMNS, scores, strict=True) if score <= min(scores) + noise)
+    return [columns for columns, score in zip(BIN_COLUMNS, scores, strict=True) if score <= min(scores) + noise]
 
 
 def _read_bytes(path):

@@ -1,6 +1,7 @@
 """A sequence of scans and what is known about it."""
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,10 @@ class Dataset:
         if times is None and self.point_times == "azimuth":
             times = azimuth_times(points)
         return RawScan(points, times)
+
+    def __iter__(self) -> Iterator[RawScan]:
+        """Scans in order."""
+        return (self[index] for index in range(len(self)))
 
     def describe(self) -> list[str]:
         """Lines for a user: what was found and what is done to it."""

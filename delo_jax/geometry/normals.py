@@ -44,7 +44,7 @@ def _longest(vectors):
     return vectors[:, best, columns], length2[best, columns]
 
 
-def _least_direction(xx, xy, xz, yy, yz, zz, least):
+def _least_direction(least, xx, xy, xz, yy, yz, zz):
     """Unit eigenvectors (3, n) of eigenvalue `least`: the row space of M - least I is what they are normal to."""
     a, b, c = np.stack([xx - least, xy, xz]), np.stack([xy, yy - least, yz]), np.stack([xz, yz, zz - least])
     row, row2 = _longest(np.stack([a, b, c], axis=1))
@@ -79,5 +79,5 @@ def plane_fit(neighbors: Float32[np.ndarray, "n k 3"], valid: Bool[np.ndarray, "
     x, y, z = (planes - centroid[:, None, :]) * weight
     moments = [np.einsum("kn,kn->n", a, b).astype(np.float64) / count for a, b in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))]
     eigenvalues = _eigenvalues(*moments)
-    normal = _least_direction(*moments, eigenvalues[0])
+    normal = _least_direction(eigenvalues[0], *moments)
     return PlaneFit(*(np.ascontiguousarray(field.T, dtype=np.float32) for field in (centroid, normal, eigenvalues)))

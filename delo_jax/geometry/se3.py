@@ -211,5 +211,5 @@ def rotation_angle(R: Float[AnyArray, "*b 3 3"]) -> Float[AnyArray, "*b"]:
 def interpolate(T: Float[AnyArray, "4 4"], fraction: float | Float[AnyArray, "*b"]) -> Float[AnyArray, "*b 4 4"]:
     """Poses `exp(fraction log T)` along the screw motion from the identity (0) to T (1); extrapolates."""
     xp = _namespace(T)
-    fraction = xp.asarray(fraction, dtype=T.dtype)[..., None]
-    return exp(fraction * log(T).reshape((1,) * (fraction.ndim - 1) + (6,)))
+    share = xp.asarray(fraction, dtype=T.dtype)[..., None]
+    return exp(share * log(T).reshape((1,) * (share.ndim - 1) + (6,)))

@@ -99,6 +99,7 @@ class Registration(NamedTuple):
     T_target_source: Float[Array, "4 4"]
     information: Float[Array, "6 6"]  # of a left twist in the target frame, per unit of squared metre
     nig: evidence.NIG  # of log(T_pred^-1 T_true), order [omega, v], rad and m
+    confidence: Float[Array, ""]  # probability that the pair is not lost
     statistics: Float[Array, " s"]
     observability: Float[Array, "3"]  # ascending eigenvalues of the mean weighted n n^T; 1/3 each when even
     weakest_axis: Float[Array, "3"]  # unit direction in the target frame that is seen worst
@@ -146,8 +147,8 @@ def refine_pose(model: Model, source: fine.Cloud, target: fine.Cloud, T_init, *,
 def solve(model: Model, source: Encoding, target: Encoding, T_init: Float[Array, "4 4"]) -> Registration:
     """Pose of a pair, its information, evidence and statistics.
 
-    Two hypotheses, the start and the coarse pose, are refined side by side on half of the points; the one that the
-    learned confidences like better is finished on all of them. A good start is never spoilt by a bad coarse pose,
+    Two hypotheses, the start and the coarse pose, are refined side by side on half of the points; the one that more
+    points agree with is finished on all of them. A good start is never spoilt by a bad coarse pose,
     and a bad start never hides a good one.
 
     Args:
@@ -165,34 +166,45 @@ def solve(model: Model, source: Encoding, target: Encoding, T_init: Float[Array,
     starts = jnp.stack([T_init, first.T_target_source])
     num_first = cfg.num_iters // 2
     refined = jax.vmap(lambda T: refine_pose(model, half, target.cloud, T, num_iters=num_first)[-1])(starts)
-    scores = jax.vmap(lambda T: _score(fine.match(model.confidence, half, target.cloud, T)))(refined)
+    scores = jax.vmap(lambda T: consensus(fine.match(model.confidence, half, target.cloud, T)))(refined)
     best = jnp.argmax(scores)
     T = refine_pose(model, points, target.cloud, refined[best], num_iters=cfg.num_iters - num_first)[-1]
     matches = fine.match(model.confidence, points, target.cloud, T)
     T_delta, information = fine.step(matches, cfg=cfg)
     disagreement = se3.inverse(refined[1 - best]) @ refined[best]
     stats = statistics(matches, information, T, T_delta, disagreement, first.inlier_share, scores[1 - best])
-    nig = predict_evidence(model, stats)
+    nig, success_logit = predict_evidence(model, stats)
     values, vectors = jnp.linalg.eigh(_direction_spread(matches))
     finite = jnp.all(jnp.isfinite(T)) & jnp.all(jnp.isfinite(stats))
-    return Registration(T, information, nig, stats, values, vectors[:, 0], best == 1, finite)
+    return Registration(T, information, nig, nn.sigmoid(success_logit), stats, values, vectors[:, 0], best == 1, finite)
 
 
-def predict_evidence(model: Model, stats: Float[Array, " s"]) -> evidence.NIG:
-    """Evidence of the pose error in rad and m."""
-    cfg = model.cfg.evidence
-    nig = evidence.constrain(model.apply("evidence", stats))
-    unit = jnp.repeat(jnp.array([cfg.rotation_scale_rad, cfg.translation_scale_m]), 3)
-    return evidence.NIG(nig.gamma * unit, nig.nu, nig.alpha, nig.beta * unit**2)
+def predict_evidence(model: Model, stats: Float[Array, " s"]) -> tuple[evidence.NIG, Float[Array, ""]]:
+    """Evidence of the pose error in rad and m, and the logit of the pair not being lost."""
+    raw, success_logit = model.apply("evidence", stats)
+    nig, unit = evidence.constrain(raw), evidence_units(model.cfg)
+    return evidence.NIG(nig.gamma * unit, nig.nu, nig.alpha, nig.beta * unit**2), success_logit
+
+
+def evidence_units(cfg: DeloConfig) -> Float[Array, "6"]:
+    """Units in which the evidence head counts errors, order [omega, v], rad and m."""
+    return jnp.repeat(jnp.array([cfg.evidence.rotation_scale_rad, cfg.evidence.translation_scale_m]), 3)
 
 
 def _first(cloud: fine.Cloud, num: int) -> fine.Cloud:
     return jax.tree.map(lambda array: array[:num], cloud)
 
 
-def _score(matches: fine.Matches) -> Float[Array, ""]:
-    """How well a pose explains the scan: mean confidence, counted where the plane distance is small too."""
-    return jnp.mean(matches.weights / (1.0 + (matches.plane_distance / 0.1) ** 2))
+def consensus(matches: fine.Matches) -> Float[Array, ""]:
+    """Share of the source points that lie on a target surface of the same orientation, in [0, 1].
+
+    The learned confidences have no say: they leave out what does not fit, and would call a street that slid along
+    itself a perfect match.
+    """
+    valid = matches.weights > 0.0
+    squared = jnp.sum((matches.points - matches.targets) ** 2, axis=1)
+    fit = jnp.maximum(matches.agreement, 0.0) ** 2 / (1.0 + (matches.plane_distance / 0.1) ** 2) / (1.0 + squared)
+    return jnp.sum(jnp.where(valid, fit, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
 
 
 def _direction_spread(matches: fine.Matches) -> Float[Array, "3 3"]:
@@ -202,24 +214,36 @@ def _direction_spread(matches: fine.Matches) -> Float[Array, "3 3"]:
 
 def statistics(matches, information, T, T_delta, disagreement, inlier_share, other_score) -> Float[Array, " s"]:
     """What the solver knows about its own answer, as numbers of order one; the input of the evidence head."""
-    num_valid = jnp.sum(matches.weights > 0.0)
+    valid = matches.weights > 0.0
+    num_valid = jnp.sum(valid)
     distance = jnp.abs(matches.plane_distance)
     weight = jnp.sum(matches.weights) + 1e-6
     rms = jnp.sqrt(jnp.sum(matches.weights * distance**2) / weight)
-    quantiles = jnp.quantile(distance, jnp.array([0.25, 0.5, 0.75, 0.9]))
+    quantiles = _quantiles(distance, valid, jnp.array([0.25, 0.5, 0.75, 0.9]))
+    agreement = jnp.sum(jnp.where(valid, matches.agreement, 0.0)) / jnp.maximum(num_valid, 1)
     scale = jnp.repeat(jnp.array([1.0 / LEVER_M, 1.0]), 3)
     eigenvalues = jnp.linalg.eigvalsh(information * scale[:, None] * scale[None, :]) / weight
     lengths = jnp.stack([length for pose in (T_delta, disagreement, T) for length in _lengths(pose)])
-    score = _score(matches)
+    score = consensus(matches)
     return jnp.concatenate(
         [
             jnp.stack([weight / matches.weights.shape[0], score, other_score, score - other_score]) * 3.0,
             jnp.log10(jnp.append(quantiles, rms) + 1e-3) + 1.0,
             jnp.log10(jnp.maximum(eigenvalues, 1e-6)) + 1.0,
             jnp.log10(lengths + 1e-4) + 1.0,
-            jnp.stack([inlier_share * 2.0, jnp.mean(matches.agreement), num_valid / 1000.0]),
+            jnp.stack([inlier_share * 2.0, agreement, num_valid / 1000.0]),
         ]
     )
+
+
+def _quantiles(values: Float[Array, " n"], valid: Bool[Array, " n"], shares: Float[Array, " q"]) -> Float[Array, " q"]:
+    """Quantiles of the valid values, linear between two of them; 0 when none is valid."""
+    ordered = jnp.sort(jnp.where(valid, values, jnp.inf))
+    last = jnp.maximum(jnp.sum(valid) - 1, 0)
+    place = shares * last
+    low = jnp.floor(place).astype(jnp.int32)
+    below, above = ordered[low], ordered[jnp.minimum(low + 1, last)]
+    return jnp.where(jnp.any(valid), below + (place - low) * (above - below), 0.0)
 
 
 def _lengths(T: Float[Array, "4 4"]) -> tuple[Float[Array, ""], Float[Array, ""]]:

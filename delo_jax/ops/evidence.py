@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import betainc, gammaln
+from jax.scipy.special import gammaln
 from jaxtyping import Array, Float
 
 _FLOOR = 1e-3  # keeps nu and alpha - 1, which are divisors, away from zero
@@ -77,18 +77,3 @@ def regulariser(nig: NIG, observation: Float[Array, "*b 6"]) -> Float[Array, "*b
     Amini et al.; the paper prints 2 alpha + nu.
     """
     return jnp.abs(observation - nig.gamma) * (2.0 * nig.nu + nig.alpha)
-
-
-def interval_probability(nig: NIG, bound: Float[Array, "*b 6"]) -> Float[Array, "*b 6"]:
-    """Probability that each error is within +-bound, under the predicted Student-t centred at zero.
-
-    gamma is not used: the error is that of an answer already corrected by it, or one not biased. Differentiable in
-    `bound` only (the incomplete beta function has no derivative in its parameters here).
-
-    Args:
-        nig: the prediction.
-        bound: half-width of the interval >= 0, in the unit of the observation.
-    """
-    squared_scale = nig.beta * (1.0 + nig.nu) / (nig.nu * nig.alpha)
-    ratio = bound**2 / squared_scale
-    return betainc(0.5, nig.alpha, ratio / (2.0 * nig.alpha + ratio))

@@ -78,7 +78,7 @@ class LidarOdometry:
 
         Args:
             points: (n, 3) in the sensor frame [m].
-            stamp_ns: time of the scan; frame number times 0.1 s when None.
+            stamp_ns: time of the scan; 0.1 s after the last one when None.
             times_s: (n,) time of each point relative to the stamp, for the de-skew; None when already compensated.
 
         Raises:
@@ -92,7 +92,7 @@ class LidarOdometry:
         times_s = times_s if self._deskew else None
         target = Source(self._prepare_at(points, times_s), points, times_s, stamp_ns)
         prepared = time.perf_counter()
-        motion = self._first(target) if self._source is None else self._align_to(self._source, target)
+        motion, target = (self._first(target), target) if self._source is None else self._align_to(self._source, target)
         timing = {"prepare": prepared - begin, "solve": time.perf_counter() - prepared}
         return self._finish(target, motion, stamp_ns, timing)
 
@@ -107,7 +107,7 @@ class LidarOdometry:
 
     def _check_stamp(self, stamp_ns: int | None) -> int:
         if stamp_ns is None:
-            return self._num_frames * DEFAULT_PERIOD_NS
+            return self._last_stamp_ns + DEFAULT_PERIOD_NS if self._num_frames else 0
         if self._num_frames and stamp_ns <= self._last_stamp_ns:
             raise ScanError(f"stamp_ns: expected more than the last stamp {self._last_stamp_ns}, got {stamp_ns}; sort the scans by time")
         return int(stamp_ns)
@@ -126,17 +126,18 @@ class LidarOdometry:
             T_target_source=np.eye(4), covariance=np.zeros((6, 6)), aleatoric=zero, epistemic=zero, status="ok", confidence=1.0, reason=""
         )
 
-    def _align_to(self, source: Source, target: Source) -> Estimate:
-        """Motion T_source_target of a pair, started from the motion model's prediction."""
+    def _align_to(self, source: Source, target: Source) -> tuple[Estimate, Source]:
+        """Motion T_source_target of a pair, started from the motion model's prediction, and the target as it was aligned."""
         elapsed_s = (target.stamp_ns - source.stamp_ns) * NANOSECOND
         guess = se3.inverse(self._motion_model.predict(elapsed_s))
         estimate = self._align(self._params, source.scan, target.scan, guess)
         if self._motion_model.velocity is None and target.times_s is not None and estimate.status != "rejected":
             # the first motion de-skews its own two scans, then is measured again
             self._motion_model.update(se3.inverse(estimate.T_target_source), elapsed_s)
-            scans = [self._prepare_at(scan.points, scan.times_s) for scan in (source, target)]
-            estimate = self._align(self._params, scans[0], scans[1], estimate.T_target_source)
-        return estimate.inverted()
+            source, target = (scan._replace(scan=self._prepare_at(scan.points, scan.times_s)) for scan in (source, target))
+            estimate = self._align(self._params, source.scan, target.scan, estimate.T_target_source)
+            self._source = source
+        return estimate.inverted(), target
 
     def _unmeasured(self, stamp_ns: int, reason: str) -> Estimate:
         since = self._source.stamp_ns if self._source else stamp_ns

@@ -29,10 +29,11 @@ class ConstantVelocity:
 
         Args:
             points: (n, 3) as measured [m].
-            times_s: (n,) relative to the stamp [s].
+            times_s: (n,) relative to the stamp [s]; a point whose time is not finite counts as measured at the stamp.
         """
         if self.velocity is None or len(points) == 0:
             return points
+        times_s = np.where(np.isfinite(times_s), times_s, 0.0)
         first, last = float(np.min(times_s)), float(np.max(times_s))
         knots = np.linspace(first, last, 128)
         poses = se3.exp(knots[:, None] * self.velocity[None, :]).astype(np.float32)

@@ -32,9 +32,7 @@ def draw_facade_style(rng: np.random.Generator) -> FacadeStyle:
     )
 
 
-def building(
-    b: Builder, x: float, y: float, yaw: float, *, width: float, depth: float, height: float, style: FacadeStyle
-) -> None:
+def building(b: Builder, x: float, y: float, yaw: float, *, width: float, depth: float, height: float, style: FacadeStyle) -> None:
     """A building; (x, y) is the middle of its front, which looks along its own +y.
 
     The front consists of parts at different depths, with piers between recessed windows, bays,
@@ -49,9 +47,7 @@ def building(
         _front_part(b, float(left), float(right), front, depth, height * rng.uniform(0.9, 1.0), style)
 
 
-def _front_part(
-    b: Builder, left: float, right: float, front: float, depth: float, height: float, style: FacadeStyle
-) -> None:
+def _front_part(b: Builder, left: float, right: float, front: float, depth: float, height: float, style: FacadeStyle) -> None:
     rng = b.rng
     b.box((left, right), (-depth, front), (0.0, height))
     if right - left < 1.5:

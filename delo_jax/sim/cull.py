@@ -122,7 +122,7 @@ def find_work(
     return Work(primitive=_pad(primitive), block=_pad(block), start=_pad(starts[group]), ends=ends.astype(np.int32))
 
 
-def _pad(index: np.ndarray, smallest: int = 4096) -> np.ndarray:
+def _pad(index: np.ndarray, smallest: int = 16384) -> np.ndarray:
     """The index as int32, zeros appended up to a power of two, so that few shapes are compiled."""
     size = smallest
     while size < len(index):
@@ -130,7 +130,7 @@ def _pad(index: np.ndarray, smallest: int = 4096) -> np.ndarray:
     return np.pad(index.astype(np.int32), (0, size - len(index)))
 
 
-def make_table(primitives: Primitives, smallest: int = 1024) -> Table:
+def make_table(primitives: Primitives, smallest: int = 4096) -> Table:
     """The primitives as padded float32 arrays for the device."""
     values = np.concatenate(
         [

@@ -23,6 +23,7 @@ from delo_jax.sim.scenes import (
     match_traffic,
 )
 from delo_jax.sim.sensors import SENSORS, Sensor, draw_unit
+from delo_jax.sim.style import Style
 from delo_jax.sim.warp import Warp, max_curvature
 
 CLIP_START_M = 60.0
@@ -100,9 +101,7 @@ def simulate_drive(
     for k in range(num_scans):
         stamp_s = k * sensor.period_s
         scene = Scene(world.at(stamp_s), ground, warp)
-        yield simulate_scan(
-            scene, motion, stamp_s, sensor, jax.random.fold_in(key, k), rolling_shutter=rolling_shutter, unit=unit
-        )
+        yield simulate_scan(scene, motion, stamp_s, sensor, jax.random.fold_in(key, k), rolling_shutter=rolling_shutter, unit=unit)
 
 
 def safe_speed(warp: Warp) -> float:
@@ -113,7 +112,7 @@ def safe_speed(warp: Warp) -> float:
 class _World:
     """The part of an endless road around the vehicle; keeps what it has laid out while it is near."""
 
-    def __init__(self, style: roadside.Style, seed: int, motion: Motion):
+    def __init__(self, style: Style, seed: int, motion: Motion):
         self._style, self._seed, self._motion = style, seed, motion
         self._parts: dict[tuple[int, ...], Primitives] = {}
         rng = np.random.default_rng([seed, 29])
@@ -123,15 +122,16 @@ class _World:
     def at(self, stamp_s: float) -> Primitives:
         """All primitives near the vehicle; positions are those at time 0, had they always moved as now."""
         x = self._x(stamp_s)
-        parts = {}
+        parts: dict[tuple[int, ...], Primitives] = {}
         for index in _chunks_near(x):
             # Whoever walks here starts to do so when the vehicle comes near.
             part = self._parts.get((index,)) or _started(make_chunk(self._style, self._seed, index), stamp_s)
             parts[index,] = part
-        for lane, (_, speed) in enumerate(self._style.lanes):
-            for index in _chunks_near(x - speed * stamp_s):
-                part = self._parts.get((lane, index)) or make_traffic(self._style, self._seed, lane, index)
-                parts[lane, index] = part
+        for number, lane in enumerate(self._style.lanes):
+            # Traffic is laid out in a frame that moves with its lane.
+            for index in _chunks_near(x - lane.velocity * stamp_s):
+                part = self._parts.get((number, index)) or make_traffic(self._style, self._seed, number, index)
+                parts[number, index] = part
         self._parts = parts
         return concatenate([*parts.values(), self._lead(stamp_s)])
 

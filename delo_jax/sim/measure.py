@@ -65,10 +65,10 @@ class Measured(NamedTuple):
     keep: Bool[Array, "beams columns"]
 
 
-def _rotate(
-    matrices: Float[Array, "3 3 columns"], v: Float[Array, "3 blocks columns rings"]
-) -> Float[Array, "3 blocks columns rings"]:
-    return jnp.stack([sum(matrices[i, j][None, :, None] * v[j] for j in range(3)) for i in range(3)])
+def _rotate(matrices: Float[Array, "3 3 columns"], v: Float[Array, "3 blocks columns rings"]) -> Float[Array, "3 blocks columns rings"]:
+    rotated = jnp.stack([sum(matrices[i, j][None, :, None] * v[j] for j in range(3)) for i in range(3)])
+    # Else XLA computes the whole chain behind each component again for each of its uses.
+    return jax.lax.optimization_barrier(rotated)
 
 
 def measure(

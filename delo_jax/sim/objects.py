@@ -8,16 +8,16 @@ PIECE_M = 12.0
 """Long things are built of pieces of this length, so that rays are tested against few of them."""
 
 
-def car(b: Builder, x: float, y: float, yaw: float, speed: float = 0.0) -> None:
-    """A passenger car, a van or, rarely, a lorry, heading along `yaw`."""
+def car(b: Builder, x: float, y: float, yaw: float, speed: float = 0.0, *, lorries: bool = False) -> None:
+    """A passenger car, a van or, rarely and where allowed, a lorry, heading along `yaw`."""
     rng = b.rng
     velocity = (speed * float(np.cos(yaw)), speed * float(np.sin(yaw)))
     reflectance = float(rng.choice([0.005, 0.03, 0.2, 0.5]))
     b.begin(Label.VEHICLE, x, y, yaw, reflectance=reflectance, velocity=velocity)
     kind = rng.uniform()
-    if kind < 0.8:
+    if kind < 0.85:
         _passenger_car(b)
-    elif kind < 0.95:
+    elif kind < 0.95 or not lorries:
         length, width, height = rng.uniform(2.2, 3.1), rng.uniform(0.9, 1.0), rng.uniform(1.8, 2.7)
         b.box((-length, length - 0.9), (-width, width), (0.35, height))
         b.box((length - 0.9, length), (-width, width), (0.35, rng.uniform(1.0, 1.4)))
@@ -89,37 +89,38 @@ def pole(b: Builder, x: float, y: float, towards_road: float) -> None:
         b.post(0.0, 0.0, 2.5 * radius, (0.0, rng.uniform(0.3, 1.2)))
 
 
-def tree(b: Builder, x: float, y: float, size: float, clumps: int = 9) -> None:
-    """A broad-leaved tree or a conifer; `size` of about 1 is a grown street tree."""
+def tree(b: Builder, x: float, y: float, size: float, *, clumps: int = 9, clear_m: float = 0.0) -> None:
+    """A broad-leaved tree or a conifer; `size` of about 1 is a grown street tree, cut free up to `clear_m`."""
     rng = b.rng
     b.begin(Label.VEGETATION, x, y, rng.uniform(-3.0, 3.0), reflectance=0.4)
     height, radius = size * rng.uniform(5.0, 11.0), size * rng.uniform(1.2, 3.2)
-    mean_free_path = rng.uniform(0.15, 1.0)
+    openness = rng.uniform(0.3, 1.2)
     b.post(0.0, 0.0, size * rng.uniform(0.08, 0.3), (0.0, 0.7 * height))
-    if rng.uniform() < 0.2:
+    if rng.uniform() < 0.2 and clear_m == 0.0:
         skirt = rng.uniform(0.0, 0.15)
         for k in range(4):
             level = skirt + (0.95 - skirt) * (k + 0.3) / 4.0
-            b.crown(0.0, 0.0, level * height, radius * (1.05 - level), 0.16 * height, mean_free_path)
+            b.crown(0.0, 0.0, level * height, radius * (1.05 - level), 0.16 * height, 0.4 * openness * radius)
         return
     bottom = rng.uniform(0.1, 0.5) * height
     for _ in range(int(rng.integers(2, clumps + 1))):
         angle, offset = rng.uniform(-np.pi, np.pi), radius * rng.uniform(0.0, 0.9)
         part = radius * rng.uniform(0.2, 0.65)
-        z = max(rng.uniform(bottom, height), bottom + 0.5 * part)
-        b.crown(offset * np.cos(angle), offset * np.sin(angle), z, part, part * rng.uniform(0.5, 1.1), mean_free_path)
+        flat = rng.uniform(0.5, 1.1)
+        z = max(rng.uniform(bottom, height), bottom + 0.5 * part, clear_m + part * flat)
+        b.crown(offset * np.cos(angle), offset * np.sin(angle), z, part, part * flat, part * openness)
 
 
 def bush(b: Builder, x: float, y: float, size: float) -> None:
     """Low foliage down to the ground, of several clumps."""
     rng = b.rng
     b.begin(Label.VEGETATION, x, y, rng.uniform(-3.0, 3.0), reflectance=0.4)
-    mean_free_path = rng.uniform(0.05, 0.5)
+    openness = rng.uniform(0.15, 1.0)
     for _ in range(int(rng.integers(2, 6))):
         radius = size * rng.uniform(0.2, 0.8)
         height = radius * rng.uniform(0.5, 1.5)
         dx, dy = rng.normal(0.0, 0.5 * size, 2)
-        b.crown(dx, dy, height * rng.uniform(0.3, 1.0), radius, height, mean_free_path)
+        b.crown(dx, dy, height * rng.uniform(0.3, 1.0), radius, height, radius * openness)
 
 
 def hedge(b: Builder, x0: float, x1: float, y: float) -> None:

@@ -102,9 +102,7 @@ def first_return(
     return jnp.where((enter <= leave) & (t <= leave) & (luck < opacity), t, MISS)
 
 
-def nearest_hit(
-    rays: Rays, table: Table, work: Work
-) -> tuple[Float[Array, "blocks columns rings"], Int[Array, "blocks columns rings"]]:
+def nearest_hit(rays: Rays, table: Table, work: Work) -> tuple[Float[Array, "blocks columns rings"], Int[Array, "blocks columns rings"]]:
     """Ray parameter and primitive of the first return; `MISS` and -1 where there is none."""
     best = jnp.full_like(rays.depth, MISS), jnp.full(rays.depth.shape, -1, jnp.int32)
     start = jnp.int32(0)
@@ -131,7 +129,8 @@ def _tester(body: Callable, rays: Rays, table: Table, work: Work) -> Callable:
         time = jax.lax.dynamic_slice(rays.time, (corner[1],), (COLUMNS_PER_GROUP,))
         o, d = to_unit_frame(values, origin[:, None, :, None], direction, time[None, :, None])
         luck = jnp.mod(tile(rays.luck) + 0.618034 * index.astype(jnp.float32), 1.0)
-        t = first_return(*body(o, d), tile(rays.depth), luck, values[10], values[11])
+        enter, leave = body(o, d)
+        t = first_return(enter, leave, tile(rays.depth), luck, values[10], values[11])
         t_best, index_best = tile(best[0]), tile(best[1])
         nearer = t < t_best
         return (
@@ -157,9 +156,7 @@ def to_unit_frame(
     return o, d
 
 
-def unit_normal(
-    shape: Int[Array, "*n"], values: Float[Array, "12 ..."], point: Float[Array, "3 ..."]
-) -> Float[Array, "3 ..."]:
+def unit_normal(shape: Int[Array, "*n"], values: Float[Array, "12 ..."], point: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
     """Outward normal in the flat world at a point of the unit frame, on or below the surface.
 
     It is the gradient of the body's norm; a box has that of the face nearest to the point.

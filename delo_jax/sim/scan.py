@@ -143,9 +143,7 @@ def _find_work(
     origin = np.array([0.0, 0.0, columns.origin[2].mean()])
     primitives = take(primitives, cull.near(primitives, origin, sensor.max_range_m))
     primitives = cull.sort_by_shape(primitives)
-    wedges = cull.make_wedges(
-        columns.origin.T, np.moveaxis(columns.R_flat_lidar, 2, 0), columns.azimuth, np.asarray(beams.elevation)
-    )
+    wedges = cull.make_wedges(columns.origin.T, np.moveaxis(columns.R_flat_lidar, 2, 0), columns.azimuth, np.asarray(beams.elevation))
     work = cull.find_work(
         primitives,
         origin,

@@ -6,19 +6,22 @@ The flat world: the road runs along +x, the vehicle drives near y = 0, z = 0 is 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool
 
 from delo_jax.errors import ConfigError
 from delo_jax.sim import objects, roadside
 from delo_jax.sim.motion import Motion
 from delo_jax.sim.primitives import Builder, Primitives, concatenate, take
+from delo_jax.sim.style import Style, draw_style
 from delo_jax.sim.warp import Warp, draw_warp
 
 KINDS = ("urban", "residential", "mixed", "road", "open")
 MARGIN_M = 100.0
 """The scene reaches this far before its start and beyond its end."""
-CLEARANCE_M = 1.8
-"""Of the vehicle's path."""
+CLEARANCE_M = 1.5
+"""Of what stands or moves near the vehicle's path."""
+LANE_HALF_M = 2.0
+"""No object stands nearer to the middle of the vehicle's lane."""
 
 
 class Ground(NamedTuple):
@@ -58,7 +61,7 @@ def make_scene(kind: str, seed: int, length_m: float = 120.0) -> Scene:
     return Scene(concatenate(chunks), ground, warp)
 
 
-def draw_world(kind: str, seed: int) -> tuple[roadside.Style, Ground, Warp]:
+def draw_world(kind: str, seed: int) -> tuple[Style, Ground, Warp]:
     """What all parts of a drive share: the road's style, its surface and its course.
 
     Raises:
@@ -67,7 +70,7 @@ def draw_world(kind: str, seed: int) -> tuple[roadside.Style, Ground, Warp]:
     if kind not in KINDS:
         raise ConfigError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
     rng = np.random.default_rng([seed, KINDS.index(kind)])
-    style = roadside.draw_style(kind, rng)
+    style = draw_style(kind, rng)
     country = kind in ("road", "open")
     rough = country or rng.uniform() < 0.4
     ground = Ground(
@@ -87,16 +90,30 @@ def draw_world(kind: str, seed: int) -> tuple[roadside.Style, Ground, Warp]:
     return style, ground, warp
 
 
-def make_chunk(style: roadside.Style, seed: int, index: int) -> Primitives:
-    """The part of a scene from `index * CHUNK_M` on; its object ids are its own."""
+def make_chunk(style: Style, seed: int, index: int) -> Primitives:
+    """What stands or walks from `index * CHUNK_M` on, clear of the vehicle's lane; its object ids are its own."""
     rng = np.random.default_rng([seed, 7, index + 1_000_000])
     builder = Builder(rng, first_id=1 + 4096 * (index + 1024))
     start = index * roadside.CHUNK_M
     roadside.lay_chunk(builder, style, start, start + roadside.CHUNK_M)
-    return builder.build()
+    primitives = builder.build()
+    sin, cos = np.sin(primitives.yaw), np.cos(primitives.yaw)
+    reach = np.abs(sin) * primitives.half_size[:, 0] + np.abs(cos) * primitives.half_size[:, 1]
+    return _without(primitives, _at_body_height(primitives) & (np.abs(primitives.center[:, 1]) - reach < LANE_HALF_M))
 
 
-def make_traffic(style: roadside.Style, seed: int, lane: int, index: int) -> Primitives:
+def _at_body_height(primitives: Primitives) -> Bool[np.ndarray, " n"]:
+    """Whether a shape is in a vehicle's way: neither a kerb nor high above the road."""
+    z, half_z = primitives.center[:, 2], primitives.half_size[:, 2]
+    return (z + half_z > 0.3) & (z - half_z < 2.8)
+
+
+def _without(primitives: Primitives, unwanted: Bool[np.ndarray, " n"]) -> Primitives:
+    """The primitives without the objects that have an unwanted shape."""
+    return take(primitives, ~np.isin(primitives.object_id, primitives.object_id[unwanted]))
+
+
+def make_traffic(style: Style, seed: int, lane: int, index: int) -> Primitives:
     """The vehicles of one lane that are at time 0 within `CHUNK_M` from `index * CHUNK_M` on."""
     rng = np.random.default_rng([seed, 11, lane, index + 1_000_000])
     builder = Builder(rng, first_id=1_000_000_000 + 64 * ((index + 100_000) * 16 + lane))
@@ -110,22 +127,19 @@ def clear_path(scene: Scene, motion: Motion) -> Scene:
 
     Kerbs and what hangs high above the road stay.
     """
-    keep = ~np.isin(scene.primitives.object_id, scene.primitives.object_id[_blocking(scene.primitives, motion)])
-    return scene._replace(primitives=take(scene.primitives, keep))
+    return scene._replace(primitives=_without(scene.primitives, _blocking(scene.primitives, motion)))
 
 
-def _blocking(primitives: Primitives, motion: Motion) -> Float[np.ndarray, " n"] | np.ndarray:
-    """Mask of the shapes in the way."""
-    z, half_z = primitives.center[:, 2], primitives.half_size[:, 2]
-    solid = (z + half_z > 0.3) & (z - half_z < 2.8)
+def _blocking(primitives: Primitives, motion: Motion) -> Bool[np.ndarray, " n"]:
+    """Which shapes are in the way."""
     cos, sin = np.cos(primitives.yaw), np.sin(primitives.yaw)
-    near = np.zeros(len(z), dtype=bool)
+    near = np.zeros(len(cos), dtype=bool)
     for i in range(0, len(motion.heading), 5):
         moved = primitives.center[:, :2] + motion.times[i] * primitives.velocity
         dx, dy = (motion.position[i] - moved).T
         outside = np.abs(np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=1)) - primitives.half_size[:, :2]
         near |= np.linalg.norm(np.maximum(outside, 0.0), axis=1) < CLEARANCE_M
-    return near & solid
+    return near & _at_body_height(primitives)
 
 
 def match_traffic(scene: Scene, motion: Motion, seed: int) -> Scene:
@@ -139,12 +153,12 @@ def match_traffic(scene: Scene, motion: Motion, seed: int) -> Scene:
         if rng.uniform() < 0.35:
             gap = direction * (rng.uniform(9.0, 14.0) + speed * rng.uniform(0.0, 1.5))
             x, y = motion.position[0] + gap * np.array([np.cos(heading), np.sin(heading)])
-            objects.car(builder, float(x), float(y), heading, max(0.0, speed + rng.normal(0.0, 1.0)))
+            objects.car(builder, float(x), float(y), heading, max(0.0, speed + rng.normal(0.0, 1.0)), lorries=True)
     return scene._replace(primitives=concatenate([scene.primitives, builder.build()]))
 
 
 def lead_vehicle(rng: np.random.Generator) -> Primitives:
     """A standing vehicle at the origin, heading along x, with an id that no other object has."""
     builder = Builder(rng, first_id=2_000_000_000)
-    objects.car(builder, 0.0, 0.0, 0.0)
+    objects.car(builder, 0.0, 0.0, 0.0, lorries=True)
     return builder.build()

@@ -34,9 +34,7 @@ class Sensor:
         if self.num_columns < COLUMNS_PER_GROUP:
             raise ConfigError(f"sensor.num_columns: expected at least {COLUMNS_PER_GROUP}, got {self.num_columns}")
         if not 0.0 <= self.min_range_m < self.max_range_m:
-            raise ConfigError(
-                f"sensor.max_range_m: expected more than min_range_m, got {self.max_range_m} and {self.min_range_m}"
-            )
+            raise ConfigError(f"sensor.max_range_m: expected more than min_range_m, got {self.max_range_m} and {self.min_range_m}")
 
     @property
     def period_s(self) -> float:

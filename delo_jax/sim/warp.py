@@ -123,9 +123,7 @@ def max_curvature(warp: Warp) -> float:
     return float(np.sum(np.abs(warp.bend[:, 0]) * warp.bend[:, 1] ** 2))
 
 
-def draw_warp(
-    rng: np.random.Generator, *, max_slope: float, max_bend: float, banks: bool, verge: tuple[float, float]
-) -> Warp:
+def draw_warp(rng: np.random.Generator, *, max_slope: float, max_bend: float, banks: bool, verge: tuple[float, float]) -> Warp:
     """A random warp.
 
     Args:
@@ -147,9 +145,7 @@ def draw_warp(
     k = 2.0 * np.pi / wavelengths
     steepness = rng.dirichlet(np.ones(6)) * max_slope * rng.uniform(0.0, 1.0)
     steepness[:2] *= 0.2
-    terrain = np.stack(
-        [steepness / k, k * np.cos(heading), k * np.sin(heading), rng.uniform(0.0, 2.0 * np.pi, 6)], axis=1
-    )
+    terrain = np.stack([steepness / k, k * np.cos(heading), k * np.sin(heading), rng.uniform(0.0, 2.0 * np.pi, 6)], axis=1)
     return Warp(bend, terrain, _draw_banks(rng, banks), _draw_bumps(rng, verge))
 
 
@@ -170,7 +166,5 @@ def _draw_bumps(rng: np.random.Generator, verge: tuple[float, float]) -> Float[n
         for longest in (5.0, 14.0):
             wavelength, heading = rng.uniform(0.5, 1.0) * longest, rng.uniform(-np.pi, np.pi)
             k, a = 2.0 * np.pi / wavelength, wavelength * rng.uniform(0.0, 0.02)
-            rows.append(
-                [a, k * np.cos(heading), k * np.sin(heading), rng.uniform(0.0, 2.0 * np.pi), side, offset + 1.0]
-            )
+            rows.append([a, k * np.cos(heading), k * np.sin(heading), rng.uniform(0.0, 2.0 * np.pi), side, offset + 1.0])
     return np.array(rows)

@@ -100,7 +100,8 @@ def _batches(cfg: TrainConfig, training: list[World], mesh: Mesh, start: int, st
     sharding = NamedSharding(mesh, PartitionSpec("batch"))
 
     def make(step: int) -> PairBatch:
-        return jax.device_put(make_batch(training, cfg.batch_size, np.random.default_rng((cfg.seed, step))), sharding)
+        batch = make_batch(training, cfg.batch_size, np.random.default_rng((cfg.seed, step)), evidence=cfg.evidence_weight > 0)
+        return jax.device_put(batch, sharding)
 
     with ThreadPoolExecutor(1) as pool:
         ahead = pool.submit(make, start)

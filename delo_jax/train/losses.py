@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from delo_jax.config import StatusConfig
 from delo_jax.geometry import se3
 from delo_jax.ops import evidence
 
@@ -56,14 +57,21 @@ def pose_loss(poses: Float[Array, "t 4 4"], T_true: Float[Array, "4 4"]) -> Floa
     return jnp.sum(weights * values) / jnp.sum(weights)
 
 
-def evidence_loss(nig: evidence.NIG, T_predicted, T_true, units: Float[Array, "6"], regulariser_weight: float) -> Float[Array, ""]:
+def evidence_loss(nig: evidence.NIG, observed: Float[Array, "6"], units: Float[Array, "6"], regulariser_weight: float) -> Float[Array, ""]:
     """Negative log likelihood of the pose error plus lambda_R times its regulariser, mean over six axes.
 
     The observation is log(T_predicted^-1 T_true), divided by `units` (rad and m) so that all axes weigh alike.
     """
-    observed = se3.log(se3.inverse(T_predicted) @ T_true) / units
+    observed = observed / units
     scaled = evidence.NIG(nig.gamma / units, nig.nu, nig.alpha, nig.beta / units**2)
     likelihood = evidence.negative_log_likelihood(scaled, observed)
     # a lost pair is off by 500 units: its pull on the regulariser is bounded
     penalty = evidence.regulariser(scaled, jnp.clip(observed, -10.0, 10.0))
     return jnp.mean(likelihood + regulariser_weight * penalty)
+
+
+def success_loss(logit: Float[Array, ""], observed: Float[Array, "6"], limits: StatusConfig) -> Float[Array, ""]:
+    """Cross-entropy of the predicted probability that the pair is not lost, against whether it is."""
+    rotation, translation = (jnp.sqrt(jnp.sum(part**2)) for part in jnp.split(observed, 2))
+    good = (translation <= limits.lost_translation_m) & (rotation <= jnp.radians(limits.lost_rotation_deg))
+    return jax.nn.softplus(jnp.where(good, -logit, logit))

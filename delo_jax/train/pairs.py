@@ -45,17 +45,27 @@ def _start(T_true: np.ndarray, T_identity: np.ndarray, kind: int, rng: np.random
     return T_true @ se3.exp(xi)
 
 
-def random_pair(world: World, rng: np.random.Generator) -> PairBatch:
-    """One augmented pair (no batch axis) of two different frames of a world, in either order."""
+def random_pair(world: World, rng: np.random.Generator, *, evidence: bool = False) -> PairBatch:
+    """One augmented pair (no batch axis) of two different frames of a world, in either order.
+
+    Args:
+        world: scans and poses.
+        rng: randomness.
+        evidence: for the evidence head, which has to see failures: the start is mostly the identity however far the
+            truth is, and some pairs have lost most of their points.
+    """
     source, target = rng.choice(len(world.Ts_world_lidar), 2, replace=False)
     mirror, drop = rng.random() < 0.5, rng.choice([0.0, 0.0, 0.3])
+    if evidence and rng.random() < 0.2:
+        drop = rng.uniform(0.5, 0.97)
     yaw = rng.uniform(-np.pi, np.pi)
     relative = rng.normal() * np.radians(8.0) if rng.random() < 0.5 else 0.0
     A_source, A_target = _rotation_z(yaw), _rotation_z(yaw + relative)
     M = np.diag([1.0, -1.0 if mirror else 1.0, 1.0, 1.0])
     T = M @ se3.inverse(world.Ts_world_lidar[target]) @ world.Ts_world_lidar[source] @ M
     T_true = A_target @ T @ se3.inverse(A_source)
-    T_init = _start(T_true, A_target @ se3.inverse(A_source), int(rng.integers(2)), rng)
+    T_identity = A_target @ se3.inverse(A_source)
+    T_init = T_identity if evidence and rng.random() < 0.7 else _start(T_true, T_identity, int(rng.integers(2)), rng)
     scans = [
         _augment(Scan(*(array[frame] for array in world.scans)), A, mirror, drop, rng)
         for frame, A in ((source, A_source), (target, A_target))
@@ -63,9 +73,20 @@ def random_pair(world: World, rng: np.random.Generator) -> PairBatch:
     return PairBatch(scans[0], scans[1], T_true.astype(np.float32), T_init.astype(np.float32), np.array(rng.random() < 1 / 3))
 
 
-def make_batch(worlds: list[World], size: int, rng: np.random.Generator) -> PairBatch:
-    """`size` random pairs of random worlds, stacked."""
-    pairs = [random_pair(worlds[rng.integers(len(worlds))], rng) for _ in range(size)]
+def unrelated_pair(first: World, second: World, rng: np.random.Generator) -> PairBatch:
+    """Scans of two different worlds: no pose is right, so the truth is drawn at random, metres and tens of degrees away."""
+    a, b = random_pair(first, rng, evidence=True), random_pair(second, rng, evidence=True)
+    error = se3.exp(rng.normal(size=6) * np.repeat([np.radians(20.0), 5.0], 3))
+    return a._replace(target=b.target, T_target_source=(a.T_init @ error).astype(np.float32))
+
+
+def make_batch(worlds: list[World], size: int, rng: np.random.Generator, *, evidence: bool = False) -> PairBatch:
+    """`size` random pairs of random worlds, stacked; for the evidence head one pair in eight is of two different worlds."""
+    pairs = []
+    for _ in range(size):
+        first, second = (worlds[index] for index in rng.integers(len(worlds), size=2))
+        wrong = evidence and first is not second and rng.random() < 0.125
+        pairs.append(unrelated_pair(first, second, rng) if wrong else random_pair(first, rng, evidence=evidence))
     sources, targets, *rest = zip(*pairs, strict=True)
     stack = [Scan(*(np.stack(arrays) for arrays in zip(*scans, strict=True))) for scans in (sources, targets)]
     return PairBatch(*stack, *(np.stack(arrays) for arrays in rest))

@@ -9,6 +9,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from delo_jax.config import TrainConfig
+from delo_jax.geometry import se3
 from delo_jax.model import delo
 from delo_jax.preprocess import Scan
 from delo_jax.train import losses
@@ -57,10 +58,11 @@ def pair_loss(model: delo.Model, pair: PairBatch, cfg: TrainConfig) -> tuple[Arr
         terms["fine"] = losses.pose_loss(poses, pair.T_target_source)
     if cfg.evidence_weight > 0:
         solved = jax.lax.stop_gradient(delo.solve(model, source, target, pair.T_init))
-        nig = delo.predict_evidence(model, solved.statistics)
-        unit = model.cfg.evidence
-        units = jnp.repeat(jnp.array([unit.rotation_scale_rad, unit.translation_scale_m]), 3)
-        terms["evidence"] = losses.evidence_loss(nig, solved.T_target_source, pair.T_target_source, units, cfg.regulariser_weight)
+        nig, success_logit = delo.predict_evidence(model, solved.statistics)
+        observed = se3.log(se3.inverse(solved.T_target_source) @ pair.T_target_source)
+        units = delo.evidence_units(model.cfg)
+        terms["evidence"] = losses.evidence_loss(nig, observed, units, cfg.regulariser_weight)
+        terms["evidence"] += losses.success_loss(success_logit, observed, model.cfg.status)
     weights = {"coarse": cfg.coarse_weight, "fine": cfg.fine_weight, "evidence": cfg.evidence_weight}
     return sum((weights[name] * term for name, term in terms.items()), jnp.zeros(())), terms
 

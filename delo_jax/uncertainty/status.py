@@ -37,7 +37,7 @@ def judge(
         cfg: thresholds.
     """
     if min(num_points) < cfg.min_points:
-        which = "source" if num_points[0] < cfg.min_points else "target"
+        which = "source" if num_points[0] <= num_points[1] else "target"
         return Health("rejected", f"{which} has {min(num_points)} usable points, fewer than {cfg.min_points}", 0.0)
     if not finite:
         return Health("rejected", "the solver returned no finite pose", 0.0)

@@ -60,6 +60,14 @@ def test_few_points_are_read_as_kitti_rows(tmp_path):
     np.testing.assert_array_equal(read_scan(tmp_path / "0.bin").points, [[0, 1, 2], [4, 5, 6], [8, 9, 10]])
 
 
+@pytest.mark.parametrize("columns", [3, 5])
+def test_few_points_of_another_count_are_not_taken_for_a_damaged_file(tmp_path, columns):
+    """Oracle: the coordinates that went in; 23 rows are whole ones under this column count alone."""
+    points = street(23)
+    (tmp_path / "0.bin").write_bytes(np.hstack([points, extra_columns(23, columns)]).astype("<f4").tobytes())
+    np.testing.assert_array_equal(read_scan(tmp_path / "0.bin").points, points.astype(np.float32))
+
+
 def test_nan_infinite_and_zero_rows_are_kept(tmp_path):
     """Oracle: the array that went in, bit by bit."""
     rows = np.column_stack([street(600), np.ones(600)]).astype("<f4")
@@ -105,7 +113,8 @@ def test_npy_arrays(tmp_path):
     """Oracle: the array that numpy saved, as rows, in Fortran order and with named columns."""
     points = street(50)
     named = np.zeros(50, [("intensity", "u1"), ("z", "f8"), ("y", "f4"), ("x", ">f4"), ("t", "u4")])
-    named["x"], named["y"], named["z"], named["t"] = *points.T, np.linspace(0, 1e8, 50)
+    named["x"], named["y"], named["z"] = points[:, 0], points[:, 1], points[:, 2]
+    named["t"] = np.linspace(0, 1e8, 50)
     for name, array in {"rows": np.hstack([points, points]), "fortran": np.asfortranarray(points), "named": named}.items():
         np.save(tmp_path / f"{name}.npy", array)
         scan = read_scan(tmp_path / f"{name}.npy")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from delo_jax.ops.evidence import NIG, constrain, interval_probability, moments, negative_log_likelihood, regulariser
+from delo_jax.ops.evidence import NIG, constrain, moments, negative_log_likelihood, regulariser
 from tests.oracles.agreement import assert_gradient_is_the_slope, assert_transforms_agree
 
 
@@ -37,18 +37,6 @@ def test_likelihood_is_a_student_t(x64):
         nig, observation = jax.tree.map(lambda x: np.asarray(x, np.float64), (nig, observation))
         expected = -student_t(nig, nig.gamma).logpdf(observation)
         np.testing.assert_allclose(found, expected, **({"rtol": 1e-9} if x64 else {"rtol": 1e-5, "atol": 1e-4}))
-
-
-def test_interval_probability_is_that_of_a_student_t():
-    """Oracle: scipy.stats.t.cdf."""
-    nig = random_nig(0)
-    bound = 10 ** np.random.default_rng(1).uniform(-4, 1, size=nig.beta.shape)
-    with jax.enable_x64(True):
-        found = interval_probability(jax.tree.map(jnp.asarray, nig), jnp.asarray(bound))
-        t = student_t(nig, 0.0)
-        np.testing.assert_allclose(found, t.cdf(bound) - t.cdf(-bound), atol=1e-10)
-        zero = interval_probability(jax.tree.map(jnp.asarray, nig), jnp.zeros(bound.shape))
-        np.testing.assert_array_equal(zero, np.zeros(bound.shape))
 
 
 def test_moments_are_those_of_the_distribution():
@@ -109,8 +97,6 @@ def test_gradients_are_the_slopes():
             return jnp.sum(likelihood) + jnp.sum(sum(moments(nig)))
 
         assert_gradient_is_the_slope(loss, [rng.normal(size=24), rng.normal(size=6)])
-        nig = jax.tree.map(jnp.asarray, random_nig(0, (6,)))
-        assert_gradient_is_the_slope(lambda bound: jnp.sum(interval_probability(nig, bound)), [rng.uniform(1, 2, size=6)])
 
 
 def test_evidence_under_jit_and_vmap():
@@ -120,6 +106,6 @@ def test_evidence_under_jit_and_vmap():
 
     def everything(raw, y):
         nig = constrain(raw)
-        return nig, moments(nig), negative_log_likelihood(nig, y), regulariser(nig, y), interval_probability(nig, jnp.abs(y))
+        return nig, moments(nig), negative_log_likelihood(nig, y), regulariser(nig, y)
 
     assert_transforms_agree(everything, raw, observation)

@@ -1,0 +1,172 @@
+"""The solve of a pair: two hypotheses, padding, symmetry, statistics."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from delo_jax import inference
+from delo_jax.model import delo, fine
+from delo_jax.ops import evidence
+from delo_jax.preprocess import preprocess
+from tests.fixtures import TINY, T_street, dirty, errors, street_points, street_poses, street_scan, thinned, tiny_model
+from tests.oracles.street import pose
+
+
+def fingerprints(points_world, seed=0):
+    """Descriptors by hand: random Fourier features of the position in the world, alike within about 2 m."""
+    rng = np.random.default_rng(seed)
+    waves, phases = rng.normal(size=(3, 64)) / 1.5, rng.uniform(0, 2 * np.pi, 64)
+    features = np.cos(points_world @ waves + phases)
+    return jnp.asarray(features / np.linalg.norm(features, axis=1, keepdims=True), jnp.float32)
+
+
+def encoded(frame, descriptors="world"):
+    """Encoding of a street scan whose key points know where they are in the world, or say something random."""
+    encoding = jax.device_get(inference.encode(tiny_model(), street_scan(frame)))
+    T = street_poses()[frame]
+    world = encoding.keypoints @ T[:3, :3].T + T[:3, 3]
+    if descriptors == "random":
+        world = 1e3 * np.random.default_rng(frame).normal(size=world.shape)
+    return encoding._replace(descriptors=fingerprints(world) * encoding.keypoint_mask[:, None])
+
+
+def solve(source, target, T_init=None):
+    return jax.device_get(inference.solve(tiny_model(), source, target, jnp.asarray(np.eye(4) if T_init is None else T_init, jnp.float32)))
+
+
+def test_good_start_survives_a_hopeless_coarse_stage():
+    """Oracle: the poses of the street; descriptors are random, the start is the truth, off by the untrained fine stage at most."""
+    found = solve(encoded(0, "random"), encoded(1, "random"), T_street())
+    assert not found.used_coarse
+    assert errors(found.T_target_source, T_street())[0] < 0.25
+    assert found.finite
+
+
+def test_good_coarse_stage_survives_a_hopeless_start():
+    """Oracle: the poses of the street; descriptors know the world, the start is 9 m and 40 deg off."""
+    found = solve(encoded(0), encoded(1), pose(8.0, -4.0, 0.0, yaw_deg=40.0))
+    assert found.used_coarse
+    assert errors(found.T_target_source, T_street())[0] < 0.25
+
+
+def test_padding_changes_nothing():
+    """Oracle: symmetry; 200 valid rows of 256 that are solved for, garbage in the others, the same bytes in every output."""
+    scans = [thinned(street_scan(frame), 200, 40) for frame in (0, 1)]
+    clean, filled = (solve(*(inference.encode(tiny_model(), s) for s in pair)) for pair in (scans, [dirty(s) for s in scans]))
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(clean)]
+    leaves = zip(paths, jax.tree.leaves(clean), jax.tree.leaves(filled), strict=True)
+    assert [path for path, a, b in leaves if not np.array_equal(a, b)] == []
+
+
+def test_order_of_the_points_does_not_matter():
+    """Oracle: symmetry, up to near ties of the nearest neighbour and the order of sums: millimetres."""
+    source, target = encoded(0), encoded(1)
+    order = np.random.default_rng(0).permutation(len(target.cloud.mask))
+    head = np.random.default_rng(1).permutation(TINY.fine.num_points // 2)  # the two rounds see the first half, then all
+    shuffled = jax.tree.map(lambda a: a[order], target.cloud)
+    mixed = jax.tree.map(lambda a: np.concatenate([a[head], a[len(head) :]]), source.cloud)
+    here, there = solve(source, target), solve(source._replace(cloud=mixed), target._replace(cloud=shuffled))
+    np.testing.assert_allclose(there.T_target_source, here.T_target_source, atol=5e-3)
+
+
+@pytest.mark.parametrize("yaw_deg", [40.0, -160.0])
+def test_pose_turns_with_both_scans(yaw_deg):
+    """Oracle: symmetry; the pose of a turned pair is conjugated, what the solver knows of it stays."""
+    G = pose(z=0.0, yaw_deg=yaw_deg)
+    R = G[:3, :3].astype(np.float32)
+
+    def turned(encoding):
+        cloud = encoding.cloud._replace(points=encoding.cloud.points @ R.T, normals=encoding.cloud.normals @ R.T)
+        return encoding._replace(cloud=cloud, keypoints=encoding.keypoints @ R.T, keypoint_normals=encoding.keypoint_normals @ R.T)
+
+    here, there = solve(encoded(0), encoded(1)), solve(turned(encoded(0)), turned(encoded(1)))
+    np.testing.assert_allclose(there.T_target_source, G @ here.T_target_source @ np.linalg.inv(G), atol=5e-3)
+    np.testing.assert_allclose(there.statistics, here.statistics, atol=0.05)
+    np.testing.assert_allclose(there.observability, here.observability, atol=5e-3)
+    assert abs(np.dot(there.weakest_axis, R @ here.weakest_axis)) > 0.99
+
+
+def test_one_pair_at_a_time_or_several():
+    """Oracle: the same function in a loop; float32 sums in another order, through eight iterations."""
+    pairs = [(encoded(0), encoded(1), np.eye(4)), (encoded(1), encoded(0), np.linalg.inv(T_street()))]
+    stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *column) for column in zip(*pairs, strict=True)]
+    stacked[2] = stacked[2].astype(jnp.float32)
+    batch = jax.jit(jax.vmap(delo.solve, in_axes=(None, 0, 0, 0)))(tiny_model(), *stacked)
+    for k, pair in enumerate(pairs):
+        one = solve(*pair)
+        np.testing.assert_allclose(batch.T_target_source[k], one.T_target_source, atol=2e-3)
+        np.testing.assert_allclose(batch.statistics[k], one.statistics, atol=0.05)
+        assert batch.used_coarse[k] == one.used_coarse
+
+
+@pytest.mark.parametrize("empty", [(True, False), (False, True), (True, True)])
+def test_empty_scans_give_finite_numbers(empty):
+    """Oracle: nothing to see, nothing to move; the start comes back where there is no source."""
+    nothing = preprocess(street_points(0)[:0], TINY.preprocess)
+    scans = [nothing if gone else street_scan(frame) for frame, gone in enumerate(empty)]
+    T_init = T_street()
+    found = solve(*(inference.encode(tiny_model(), scan) for scan in scans), T_init)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    if empty[0]:
+        np.testing.assert_array_equal(found.information, np.zeros((6, 6)))
+
+
+def matches_of_the_street():
+    model = tiny_model()
+    source, target = (inference.encode(model, thinned(street_scan(frame), 200, 40)).cloud for frame in (0, 1))
+    return jax.jit(lambda a, b, T: fine.match(model.confidence, a, b, T))(source, target, jnp.asarray(T_street(), jnp.float32))
+
+
+def test_statistics_are_what_they_say():
+    """Oracle: NumPy in float64, over the valid rows alone; compiled and not."""
+    matches = matches_of_the_street()
+    T_delta, information = fine.step(matches, cfg=TINY.fine)
+    T, apart = (jnp.asarray(P, jnp.float32) for P in (T_street(), pose(0.3, 0.0, 0.1, yaw_deg=2.0)))
+    arguments = matches, information, T, T_delta, apart, jnp.asarray(0.4), jnp.asarray(0.2)
+    found, compiled = delo.statistics(*arguments), jax.jit(delo.statistics)(*arguments)
+    np.testing.assert_allclose(compiled, found, atol=1e-4)
+    assert found.shape == (delo.NUM_STATISTICS,)
+
+    valid = np.asarray(matches.weights) > 0
+    assert valid.sum() == 200
+    rows = fine.Matches(*(np.asarray(field, np.float64)[valid] for field in matches))
+    w, d, agreement = rows.weights, np.abs(rows.plane_distance), rows.agreement
+    away = np.linalg.norm(rows.points - rows.targets, axis=1)
+    score = np.mean(np.maximum(agreement, 0) ** 2 / (1 + (d / 0.1) ** 2) / (1 + away**2))
+    lever = np.diag([1 / 15.0] * 3 + [1.0] * 3)
+    eigenvalues = np.linalg.eigvalsh(lever @ np.asarray(information, np.float64) @ lever) / w.sum()
+    lengths = []
+    for P in (T_delta, apart, T):
+        P = np.asarray(P, np.float64)
+        angle = np.arctan2(np.linalg.norm([P[2, 1] - P[1, 2], P[0, 2] - P[2, 0], P[1, 0] - P[0, 1]]), np.trace(P[:3, :3]) - 1)
+        lengths += [np.linalg.norm(P[:3, 3]), 15.0 * angle]
+    expected = [
+        *(3 * w.sum() / len(valid), 3 * score, 0.6, 3 * score - 0.6),
+        *(np.log10(np.append(np.quantile(d, [0.25, 0.5, 0.75, 0.9]), np.sqrt(np.average(d**2, weights=w))) + 1e-3) + 1),
+        *(np.log10(np.maximum(eigenvalues, 1e-6)) + 1),
+        *(np.log10(np.array(lengths) + 1e-4) + 1),
+        *(0.8, agreement.mean(), 0.2),
+    ]
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+
+
+def test_evidence_is_in_the_units_of_the_config():
+    """Oracle: the same raw numbers, constrained, times 1 mrad and 1 cm; their squares for the variance."""
+    statistics = jnp.linspace(-1, 1, delo.NUM_STATISTICS)
+    raw, expected_logit = tiny_model().apply("evidence", statistics)
+    raw = evidence.constrain(raw)
+    nig, logit = delo.predict_evidence(tiny_model(), statistics)
+    assert logit == expected_logit
+    unit = np.array([1e-3] * 3 + [1e-2] * 3)
+    np.testing.assert_allclose(nig.gamma, raw.gamma * unit, rtol=1e-6)
+    np.testing.assert_allclose(nig.beta, raw.beta * unit**2, rtol=1e-6)
+    np.testing.assert_array_equal(nig.nu, raw.nu)
+    np.testing.assert_array_equal(nig.alpha, raw.alpha)
+
+
+def test_information_is_symmetric_and_positive():
+    """Oracle: the definition; a sum of outer products."""
+    information = np.asarray(solve(encoded(0), encoded(1)).information, np.float64)
+    np.testing.assert_allclose(information, information.T, rtol=1e-3, atol=1e-3 * np.abs(information).max())
+    assert np.linalg.eigvalsh(information).min() > 0

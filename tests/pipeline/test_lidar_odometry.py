@@ -1,0 +1,250 @@
+"""Streaming odometry, with a network that is never wrong."""
+
+import gc
+import weakref
+
+import numpy as np
+import pytest
+from scipy.linalg import expm, logm
+from scipy.spatial.transform import Rotation
+
+from delo_jax.errors import ScanError
+from delo_jax.inference import EncodedScan
+from delo_jax.pipeline.lidar_odometry import LidarOdometry
+from tests.oracles.registration import hat
+from tests.pipeline.exact_fakes import LANDMARKS, PARAMS, SIGMA2, UNKNOWN, ExactNetwork, see
+
+TWIST = np.array([0.02, -0.04, 0.3, 9.0, 0.4, -0.1])  # body velocity per second
+FEW = np.ones((3, 3), np.float32)
+EPOCH_NS = 1_317_384_506_123_456_789
+
+
+def make(**options):
+    network = ExactNetwork()
+    return LidarOdometry(PARAMS, prepare=network.prepare, align=network.align, **options), network
+
+
+def winding_road(num):
+    """Poses whose rotations do not commute; the first is the identity."""
+    steps = [expm(hat([0.05 * np.sin(k), 0.04, 0.3 * np.cos(k), 1.0 + 0.2 * k, 0.3 * np.sin(2 * k), 0.1])) for k in range(num - 1)]
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    return poses
+
+
+def screw(seconds):
+    """Pose at a time of the drive at constant velocity."""
+    return expm(hat(np.asarray(TWIST) * seconds))
+
+
+def test_poses_chain_into_the_trajectory():
+    """Oracle: the trajectory the scans were seen from. `frame.motion` maps current points into the previous scan."""
+    odometry, _ = make()
+    truth = winding_road(8)
+    frames = [odometry.register(see(T)) for T in truth]
+    for k, frame in enumerate(frames):
+        np.testing.assert_allclose(frame.T_world_lidar, truth[k], atol=1e-4)  # float32 points at 40 m, 7 motions
+        previous = truth[max(k - 1, 0)]
+        np.testing.assert_allclose(frame.motion.T_target_source, np.linalg.inv(previous) @ truth[k], atol=2e-5)
+        assert (frame.status, frame.motion.status) == ("ok", "ok")
+        assert frame.stamp_ns == k * 100_000_000
+        assert frame.T_world_lidar.dtype == np.float64
+    assert frames[1].T_world_lidar[0, 3] == pytest.approx(1.0, abs=0.05)  # forward is +x
+    np.testing.assert_array_equal(odometry.trajectory().Ts_world_lidar, [frame.T_world_lidar for frame in frames])
+
+
+def test_source_is_the_earlier_scan():
+    """Oracle: the order of the calls."""
+    odometry, network = make()
+    scans = [see(T) for T in winding_road(3)]
+    for points in scans:
+        odometry.register(points)
+    assert all(source is scans[k] and target is scans[k + 1] for k, (source, target) in enumerate(network.pairs))
+
+
+def test_guess_is_constant_velocity_whatever_the_stamps():
+    """Oracle: scipy's expm; from the third scan on the guess of a drive at constant velocity is already the answer."""
+    odometry, network = make()
+    stamps_s = [0.0, 0.1, 0.25, 0.3, 0.7]
+    for time in stamps_s:
+        odometry.register(see(screw(time)), stamp_ns=EPOCH_NS + round(time * 1e9))
+    np.testing.assert_array_equal(network.starts[0], np.eye(4))
+    for k in range(1, 4):
+        np.testing.assert_allclose(network.starts[k], screw(stamps_s[k] - stamps_s[k + 1]), atol=2e-4)  # 0.1 s of float32 over 0.4 s
+
+
+def test_bad_scans_are_carried_and_bridged():
+    """Oracle: the drive at constant velocity. The bad scans' poses are predictions, the next good one is measured across the gap."""
+    odometry, network = make()
+    frames = [odometry.register(FEW if k in (3, 4) else see(screw(0.1 * k))) for k in range(7)]
+    assert [frame.status for frame in frames] == ["ok"] * 3 + ["rejected"] * 2 + ["ok"] * 2
+    for k, frame in enumerate(frames):
+        np.testing.assert_allclose(frame.T_world_lidar, screw(0.1 * k), atol=1e-3)
+    source, target = network.pairs[-2]
+    np.testing.assert_array_equal(source, see(screw(0.2)))
+    np.testing.assert_array_equal(target, see(screw(0.5)))
+    np.testing.assert_allclose(network.starts[-2], screw(-0.3), atol=1e-4)  # predicted over all three steps
+    np.testing.assert_allclose(frames[5].motion.T_target_source, screw(0.3), atol=2e-5)
+
+
+def test_covariance_grows_while_nobody_measures():
+    """Oracle: by hand. Standard deviations are 1, 2, 3 times those of an unknown pose; one good pair ends it."""
+    odometry, _ = make()
+    standing = see(np.eye(4))
+    frames = [odometry.register(points) for points in (standing, standing, FEW, FEW)]
+    frames += [odometry.reject("file is truncated"), odometry.register(standing)]
+    for count, frame in enumerate(frames[2:5], start=1):
+        np.testing.assert_allclose(frame.motion.covariance, count**2 * np.diag(UNKNOWN), rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(frame.covariance, np.diag(count**2 * UNKNOWN + SIGMA2), rtol=1e-4, atol=1e-12)
+        np.testing.assert_allclose(frame.motion.aleatoric + frame.motion.epistemic, count**2 * UNKNOWN, rtol=1e-6)
+    assert frames[4].motion.reason == "file is truncated"
+    assert (frames[4].status, frames[4].motion.confidence) == ("rejected", 0.0)
+    np.testing.assert_allclose(frames[5].covariance, np.diag(2 * SIGMA2), rtol=1e-4, atol=1e-12)
+
+
+def test_world_is_the_first_good_scan():
+    """Oracle: the trajectory, seen from its second pose on."""
+    odometry, _ = make()
+    truth = winding_road(5)
+    frames = [odometry.reject("unreadable"), odometry.register(FEW), *(odometry.register(see(T)) for T in truth[1:])]
+    assert [frame.status for frame in frames] == ["rejected", "rejected", "ok", "ok", "ok", "ok"]
+    assert frames[1].motion.reason == "the first scan has 3 usable points, fewer than 20"
+    np.testing.assert_allclose(frames[1].motion.covariance, 4 * np.diag(UNKNOWN))
+    for frame, T in zip(frames[2:], truth[1:], strict=True):
+        np.testing.assert_allclose(frame.T_world_lidar, np.linalg.inv(truth[1]) @ T, atol=1e-4)
+    np.testing.assert_array_equal(frames[2].covariance, np.zeros((6, 6)))
+
+
+def test_rejected_frame_follows_the_motion_model():
+    """Oracle: scipy's expm at the stamp of the unreadable scan."""
+    odometry, _ = make()
+    for time in (0.0, 0.1):
+        odometry.register(see(screw(time)), stamp_ns=round(time * 1e9))
+    frame = odometry.reject("unreadable", stamp_ns=350_000_000)
+    np.testing.assert_allclose(frame.T_world_lidar, screw(0.35), atol=2e-4)
+    assert frame.stamp_ns == 350_000_000
+
+
+def test_missing_stamps_go_on_from_the_last_one():
+    """Oracle: by hand, 0.1 s a frame; also after stamps that were given."""
+    odometry, _ = make()
+    stamps = [odometry.register(see(np.eye(4)), stamp_ns=stamp).stamp_ns for stamp in (None, None, 7_000_000_000, None)]
+    stamps.append(odometry.reject("unreadable").stamp_ns)
+    assert stamps == [0, 100_000_000, 7_000_000_000, 7_100_000_000, 7_200_000_000]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((np.zeros((60, 4)),), r"points: expected an array of shape \(n, 3\)"),
+        ((np.zeros((60, 3), bool),), "points: expected numbers, got dtype bool"),
+        ((see(np.eye(4)), 100_000_000), "stamp_ns: expected more than the last stamp 100000000, got 100000000; sort the scans"),
+        ((see(np.eye(4)), 5), "stamp_ns: expected more than"),
+        ((see(np.eye(4)), None, np.zeros(59)), r"times_s: expected one time per point, shape \(60,\), got \(59,\)"),
+    ],
+)
+def test_refused_scan_leaves_no_trace(arguments, message):
+    """Oracle: the same drive without the refused scan, byte by byte."""
+    truth = winding_road(5)
+    (disturbed, _), (quiet, _) = make(), make()
+    for k, T in enumerate(truth):
+        if k == 2:
+            with pytest.raises(ScanError, match=message):
+                disturbed.register(*arguments)
+        found, expected = disturbed.register(see(T)), quiet.register(see(T))
+        assert found.T_world_lidar.tobytes() == expected.T_world_lidar.tobytes()
+        assert found.covariance.tobytes() == expected.covariance.tobytes()
+        assert found.stamp_ns == expected.stamp_ns
+    assert len(disturbed.trajectory()) == len(truth)
+
+
+def skewed(seconds, times):
+    """A sweep of the drive at constant velocity: landmark i at its own time, in the sensor's frame of that instant."""
+    Ts_lidar_world = expm(np.array([hat(-(seconds + t) * TWIST) for t in times]))
+    return np.einsum("nij,nj->ni", Ts_lidar_world[:, :3], np.hstack([LANDMARKS, np.ones((len(LANDMARKS), 1))])).astype(np.float32)
+
+
+def test_moving_sweeps_are_compensated_from_the_first_pair_on():
+    """Oracle: closed form. Every scan that is aligned, but for the first try of the first pair, shows the world at its stamp.
+
+    Tolerance: half a step between the 128 instants of the de-skew, 9 m/s and 0.3 rad/s at 40 m, over 0.1 s.
+    """
+    step = (9.0 + 0.3 * 45.0) * 0.1 / 127 / 2
+    odometry, network = make()
+    times = np.random.default_rng(0).uniform(-0.05, 0.05, len(LANDMARKS))
+    frames = [odometry.register(skewed(0.1 * k, times), times_s=times) for k in range(4)]
+    assert len(network.pairs) == 4  # the first pair is solved twice
+    for (source, target), k in zip(network.pairs[1:], (0, 1, 2), strict=True):
+        assert np.abs(source - see(screw(0.1 * k))).max() < step
+        assert np.abs(target - see(screw(0.1 * k + 0.1))).max() < step
+    raw = network.pairs[0][1]
+    assert np.abs(raw - see(screw(0.1))).max() > 10 * step
+    for k, frame in enumerate(frames):
+        np.testing.assert_allclose(frame.T_world_lidar, screw(0.1 * k), atol=2 * step)
+
+
+def test_first_pair_starts_again_from_its_own_answer():
+    """Oracle: the call; the second try starts where the first one ended."""
+    odometry, network = make()
+    times = np.linspace(-0.05, 0.05, len(LANDMARKS))
+    for k in range(2):
+        odometry.register(skewed(0.1 * k, times), times_s=times)
+    np.testing.assert_array_equal(network.starts[0], np.eye(4))
+    np.testing.assert_allclose(network.starts[1], screw(-0.1), atol=1e-4)
+
+
+def test_deskew_can_be_switched_off():
+    """Oracle: the points that were given."""
+    odometry, network = make(deskew=False)
+    times = np.linspace(-0.05, 0.05, len(LANDMARKS))
+    scans = [skewed(0.1 * k, times) for k in range(3)]
+    for points in scans:
+        odometry.register(points, times_s=times)
+    assert all(prepared is points for prepared, points in zip(network.prepared, scans, strict=True))
+
+
+def test_world_covariance_is_that_of_noisy_drives():
+    """Oracle: Monte Carlo. 2,000 drives whose estimates scatter as they say; three standard errors of a correlation are 7 %."""
+    truth = winding_road(5)
+    odometry, _ = make()
+    frame = [odometry.register(see(T)) for T in truth][-1]
+    rng = np.random.default_rng(0)
+    num = 2000
+    T_world = np.tile(np.eye(4), (num, 1, 1))
+    for k in range(4):
+        T_target_source = np.linalg.inv(truth[k + 1]) @ truth[k]
+        noise = rng.normal(size=(num, 6)) * np.sqrt(SIGMA2)
+        estimates = T_target_source @ expm(np.array([hat(xi) for xi in noise]))
+        T_world = T_world @ np.linalg.inv(estimates)
+    errors = np.linalg.inv(truth[-1]) @ T_world
+    samples = np.hstack([Rotation.from_matrix(errors[:, :3, :3]).as_rotvec(), errors[:, :3, 3]])
+    scale = np.sqrt(np.outer(np.diag(frame.covariance), np.diag(frame.covariance)))
+    np.testing.assert_allclose(np.cov(samples.T) / scale, frame.covariance / scale, atol=0.1)
+    some = np.real(logm(errors[0]))[:3, 3]
+    np.testing.assert_allclose(samples[0, 3:], some, atol=2e-3)  # for errors this small the translation is that of the twist
+
+
+def test_scans_do_not_pile_up():
+    """Oracle: weak references; of all scans given only the last stays alive in the odometry."""
+    odometry = LidarOdometry(
+        PARAMS,
+        prepare=lambda params, points: EncodedScan(points, len(points)),
+        align=lambda *arguments: ExactNetwork().align(*arguments),
+    )
+    alive = []
+    for T in winding_road(6):
+        points = see(T)
+        alive.append(weakref.ref(points))
+        odometry.register(points)
+        del points
+    gc.collect()
+    assert sum(reference() is not None for reference in alive) <= 1
+
+
+def test_frames_are_timed():
+    """Oracle: the documented stages; seconds, not negative."""
+    odometry, _ = make()
+    frame = odometry.register(see(np.eye(4)))
+    assert frame.timing.keys() == {"prepare", "solve"}
+    assert all(0.0 <= seconds < 60.0 for seconds in frame.timing.values())

@@ -1,0 +1,155 @@
+"""Configuration: TOML in and out, refusals by name, immutability."""
+
+import dataclasses
+import inspect
+import tomllib
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from delo_jax.config import (
+    CoarseConfig,
+    DeloConfig,
+    EvidenceConfig,
+    FineConfig,
+    PreprocessConfig,
+    StatusConfig,
+    TrainConfig,
+    from_dict,
+    load,
+    to_toml,
+)
+from delo_jax.errors import ConfigError
+
+ALL = [PreprocessConfig, CoarseConfig, FineConfig, EvidenceConfig, StatusConfig, DeloConfig, TrainConfig]
+CHANGED = TrainConfig(
+    model=DeloConfig(name="it's", coarse=CoarseConfig(mass=1.0), evidence=EvidenceConfig(rotation_scale_rad=1e-30)),
+    seed=-3,
+    learning_rate=1e22,
+)
+
+
+@pytest.mark.parametrize("config", [*(cls() for cls in ALL), CHANGED], ids=lambda config: type(config).__name__)
+def test_toml_says_what_the_config_holds(config, tmp_path):
+    """Oracle: tomllib against dataclasses.asdict; `load` then gives an equal config."""
+    text = to_toml(config)
+    assert tomllib.loads(text) == dataclasses.asdict(config)
+    (tmp_path / "config.toml").write_text(text, encoding="utf-8")
+    assert load(type(config), tmp_path / "config.toml") == config
+
+
+@example("\x7f\n\"\\")
+@given(st.text(st.characters(exclude_categories=["Cs"])))
+def test_any_name_survives(name):
+    """Oracle: tomllib; quotes, backslashes, line breaks and control characters included."""
+    assert tomllib.loads(to_toml(DeloConfig(name=name)))["name"] == name
+
+
+def test_missing_keys_keep_their_defaults(tmp_path):
+    """Oracle: dataclasses.replace."""
+    (tmp_path / "config.toml").write_text("seed = 7\n[model.coarse]\nmass = 1\n")
+    expected = dataclasses.replace(TrainConfig(), seed=7, model=DeloConfig(coarse=CoarseConfig(mass=1.0)))
+    found = load(TrainConfig, tmp_path / "config.toml")
+    assert found == expected
+    assert type(found.model.coarse.mass) is float
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"coarse": {"mas": 0.3}}, r"config\.coarse: expected one of num_neighbors, .*, got 'mas'; did you mean 'mass'\?"),
+        ({"preproces": {}}, r"config: expected one of name, .*, got 'preproces'; did you mean 'preprocess'\?"),
+        ({"fine": {"zzz": 1}}, r"config\.fine: expected one of [^;]*, got 'zzz'$"),
+    ],
+)
+def test_unknown_key_is_named_with_its_neighbour(table, message):
+    """Oracle: the sentence, written by hand."""
+    with pytest.raises(ConfigError, match=message):
+        from_dict(DeloConfig, table)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"num_steps": "many"}, "config.num_steps: expected a value of type int, got 'many'"),
+        ({"num_steps": 1.5}, "config.num_steps: expected a value of type int, got 1.5"),
+        ({"num_steps": True}, "config.num_steps: expected a value of type int, got True"),
+        ({"learning_rate": False}, "config.learning_rate: expected a value of type float, got False"),
+        ({"learning_rate": [1.0]}, "config.learning_rate: expected a value of type float"),
+        ({"model": 3}, "config.model: expected a table, got 3"),
+        ({"model": {"name": 3}}, "config.model.name: expected a value of type str, got 3"),
+        ({"seed": {"a": 1}}, "config.seed: expected a value of type int"),
+    ],
+)
+def test_wrong_type_is_refused(table, message):
+    """Oracle: the sentence, written by hand; an integer where a float is meant is taken, nothing else is."""
+    with pytest.raises(ConfigError, match=message):
+        from_dict(TrainConfig, table)
+
+
+@pytest.mark.parametrize(
+    ("cls", "values"),
+    [
+        (PreprocessConfig, {"min_range_m": -1.0}),
+        (PreprocessConfig, {"min_range_m": 80.0}),
+        (PreprocessConfig, {"max_range_m": float("nan")}),
+        (PreprocessConfig, {"voxel_m": 0.0}),
+        (PreprocessConfig, {"voxel_m": 0.8}),
+        (PreprocessConfig, {"num_neighbors": 4}),
+        (PreprocessConfig, {"ground_share": 0.0}),
+        (PreprocessConfig, {"num_keypoints": 0}),
+        (PreprocessConfig, {"num_keypoints": 4000}),
+        (CoarseConfig, {"mass": 0.0}),
+        (CoarseConfig, {"mass": 1.01}),
+        (CoarseConfig, {"num_iters": 0}),
+        (FineConfig, {"num_points": 15}),
+        (FineConfig, {"num_iters": 1}),
+        (StatusConfig, {"ok_confidence": 1.5}),
+        (StatusConfig, {"rejected_confidence": 0.9}),
+        (DeloConfig, {"coarse": CoarseConfig(num_neighbors=400)}),
+        (TrainConfig, {"num_frames": 1}),
+        (TrainConfig, {"num_scenes": 0}),
+        (TrainConfig, {"num_validation_scenes": 0}),
+        (TrainConfig, {"batch_size": 0}),
+        (TrainConfig, {"num_iters": 5}),
+        (TrainConfig, {"validate_every": 0}),
+    ],
+)
+def test_value_out_of_range_is_refused_by_name(cls, values):
+    """Oracle: the documented ranges; the message names the field that was given, or the one it collides with."""
+    with pytest.raises(ConfigError, match=r"^[a-z_.]+: expected .*, got "):
+        cls(**values)
+
+
+def test_unreadable_files_are_one_sentence(tmp_path):
+    """Oracle: the file's name and what is wrong with it."""
+    with pytest.raises(ConfigError, match="missing.toml: expected a readable TOML file, got No such file"):
+        load(DeloConfig, tmp_path / "missing.toml")
+    with pytest.raises(ConfigError, match="got Is a directory"):
+        load(DeloConfig, tmp_path)
+    for content in (b"name = ", b"\xff\xfe\x00"):
+        (tmp_path / "bad.toml").write_bytes(content)
+        with pytest.raises(ConfigError, match="bad.toml: expected valid TOML, got .*; mend the file"):
+            load(DeloConfig, tmp_path / "bad.toml")
+
+
+@pytest.mark.parametrize("cls", ALL)
+def test_configs_are_values(cls):
+    """Oracle: equal configs have equal hashes, and none can be changed, so that they may be static under jit."""
+    assert hash(cls()) == hash(cls())
+    assert cls() == cls()
+    name = dataclasses.fields(cls)[0].name
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(cls(), name, 1)
+    with pytest.raises(TypeError):
+        cls(1)
+
+
+@pytest.mark.parametrize("cls", ALL)
+def test_every_field_is_documented(cls):
+    """Oracle: the source; one docstring under every field, from which the command line takes its help."""
+    lines = [line.strip() for line in inspect.getsource(cls).splitlines()]
+    for field in dataclasses.fields(cls):
+        index = next(i for i, line in enumerate(lines) if line.startswith(f"{field.name}:"))
+        assert lines[index + 1].startswith('"""'), field.name

@@ -1,0 +1,231 @@
+"""Raw points to a `Scan`."""
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from scipy.spatial import cKDTree
+from scipy.stats import ks_2samp
+
+from delo_jax.config import PreprocessConfig
+from delo_jax.errors import ScanError
+from delo_jax.preprocess import HORIZONTAL, NUM_FEATURES, one_per_voxel, preprocess, voxel_mean
+from tests.fixtures import simulated_clip
+from tests.oracles import street
+
+CFG = PreprocessConfig()
+
+
+def rotation_z(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def valid_rows(scan):
+    return scan.points[scan.mask], scan.normals[scan.mask], scan.features[scan.mask]
+
+
+def assert_well_formed(scan, cfg):
+    """Documented shapes and dtypes, valid rows first, unit normals towards the sensor, nothing that is not finite."""
+    m, k = cfg.max_points, cfg.num_keypoints
+    shapes = [(m, 3), (m, 3), (m, NUM_FEATURES), (m,), (k,), (k,)]
+    assert [array.shape for array in scan] == shapes
+    assert [array.dtype for array in scan] == [np.float32] * 3 + [bool, np.int32, bool]
+    for mask in (scan.mask, scan.keypoint_mask):
+        np.testing.assert_array_equal(mask, np.arange(len(mask)) < mask.sum())
+    points, normals, _ = valid_rows(scan)
+    assert all(np.isfinite(array).all() for array in scan)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
+    assert np.all(np.sum(points * normals, axis=1) <= 1e-3)
+    assert np.all(scan.mask[scan.keypoint_index[scan.keypoint_mask]])
+    assert len(np.unique(scan.keypoint_index[scan.keypoint_mask])) == scan.keypoint_mask.sum()
+    for array in scan[:3]:
+        assert not np.any(array[~scan.mask])
+
+
+BLOB = (np.random.default_rng(0).normal(size=(4000, 3)) * [8, 8, 0.3]).astype(np.float32)
+USELESS = {
+    "empty": np.zeros((0, 3), np.float32),
+    "one point": np.array([[5.0, 0.0, 0.0]]),
+    "ten points": np.random.default_rng(0).uniform(5, 6, (10, 3)),
+    "all at the sensor": np.zeros((1000, 3)),
+    "all equal": np.full((1000, 3), 7.0),
+    "all NaN": np.full((1000, 3), np.nan),
+    "all infinite": np.full((1000, 3), np.inf),
+    "too far": np.full((1000, 3), 1e4) + np.arange(1000)[:, None],
+    "beyond float32": np.full((1000, 3), 1e300),
+    "beyond its square": np.full((1000, 3), 3e38, np.float32),
+}
+USABLE = {
+    "some NaN": np.where(np.arange(4000)[:, None] % 3 == 0, np.nan, BLOB),
+    "some infinite": np.where(np.arange(4000)[:, None] % 3 == 0, -np.inf, BLOB),
+    "some huge": np.where(np.arange(4000)[:, None] % 3 == 0, 1e38, BLOB),
+    "float64": np.asarray(BLOB, np.float64),
+    "integers": np.round(BLOB).astype(np.int16),
+    "a line": np.linspace(3, 60, 3000)[:, None] * [1.0, 0.0, 0.0],
+    "a wall": np.stack([np.full(3000, 9.0), *np.random.default_rng(1).uniform(-9, 9, (2, 3000))], axis=1),
+}
+
+
+@pytest.mark.parametrize("name", USELESS)
+def test_useless_input_gives_an_empty_scan(name):
+    """Oracle: the geometry; no five neighbours span a plane there. Warnings are errors in every test."""
+    scan = preprocess(USELESS[name], CFG)
+    assert_well_formed(scan, CFG)
+    assert scan.mask.sum() == 0 or name == "ten points"
+
+
+@pytest.mark.parametrize("name", USABLE)
+def test_odd_input_gives_a_well_formed_scan(name):
+    """Oracle: the documented form of a scan."""
+    scan = preprocess(USABLE[name], CFG)
+    assert_well_formed(scan, CFG)
+    assert scan.mask.any() or name == "a line"
+
+
+@given(npst.arrays(np.float32, st.tuples(st.integers(0, 60), st.just(3)), elements=st.floats(width=32)))
+def test_any_floats_give_a_well_formed_scan(points):
+    """Oracle: the documented form of a scan."""
+    assert_well_formed(preprocess(points, CFG), CFG)
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.zeros((5, 4)), r"points: expected an array of shape \(n, 3\) in metres, got shape \(5, 4\); pass points\[:, :3\]"),
+        (np.zeros(3), r"got shape \(3,\)$"),
+        (np.zeros((5, 2)), r"got shape \(5, 2\)$"),
+        (np.zeros((1, 5, 3)), r"got shape \(1, 5, 3\)$"),
+        (np.array([]), r"got shape \(0,\)$"),
+        (np.zeros((5, 3), complex), "points: expected numbers, got dtype complex128; convert to float32"),
+        (np.zeros((5, 3), bool), "got dtype bool"),
+        (np.full((5, 3), "a"), "got dtype <U1"),
+        (np.full((5, 3), None), "got dtype object"),
+    ],
+)
+def test_wrong_shape_or_dtype_is_one_sentence(points, message):
+    """Oracle: the sentence, written by hand."""
+    with pytest.raises(ScanError, match=message):
+        preprocess(points, CFG)
+
+
+def test_same_scan_same_bytes():
+    """Oracle: repetition, on a copy; the input is left as it was."""
+    points = street.scan(street.pose(), noise_m=0.02).points
+    before = points.tobytes()
+    first, second = (preprocess(array, CFG) for array in (points, points.copy()))
+    assert points.tobytes() == before
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(first, second, strict=True))
+    np.testing.assert_array_equal(preprocess(points.astype(np.float64), CFG).points, first.points)
+
+
+def test_points_lie_on_their_planes_and_normals_look_at_the_sensor():
+    """Oracle: the analytic planes of the street. With 2 cm of noise, the fit over neighbours at least halves it."""
+    truth = street.scan(street.pose(yaw_deg=20.0))
+    noisy = street.scan(street.pose(yaw_deg=20.0), noise_m=0.02).points
+    scan = preprocess(noisy, CFG)
+    assert_well_formed(scan, CFG)
+    points, normals, features = valid_rows(scan)
+    _, index = cKDTree(truth.points).query(points)
+    plane_error = np.abs(np.sum(truth.normals[index] * points, axis=1) - truth.offsets[index])
+    raw = np.abs(np.sum(truth.normals * noisy, axis=1) - truth.offsets)
+    smooth = features[:, 2] < np.log10(0.03) + 1.5  # thinner than 3 cm: neither an edge nor a pole
+    assert smooth.mean() > 0.7
+    assert np.median(plane_error[smooth]) < 0.5 * np.median(raw)
+    cosine = np.sum(truth.normals[index] * normals, axis=1)
+    assert np.degrees(np.arccos(np.clip(np.median(cosine[smooth]), -1, 1))) < 3.0
+    assert np.mean(cosine[smooth] > np.cos(np.radians(15))) > 0.95
+
+
+def test_normals_of_a_simulated_scan():
+    """Oracle: simulator truth, normals of the nearest measured point; edges, foliage and noise take their share."""
+    truth = simulated_clip()[0]
+    points, normals, features = valid_rows(preprocess(truth.points, CFG))
+    flat = features[:, 0] < 0.1  # sqrt(smallest / largest eigenvalue)
+    _, index = cKDTree(truth.points).query(points[flat])
+    cosine = np.sum(truth.normals[index] * normals[flat], axis=1)
+    assert flat.sum() > 500
+    assert np.median(cosine) > np.cos(np.radians(8))
+
+
+@pytest.mark.parametrize("yaw", [0.4, np.pi / 2, 2.5])
+def test_features_do_not_change_when_the_sensor_yaws(yaw):
+    """Oracle: symmetry. Points 0.36 m apart are alone in their 0.2 m voxel at any yaw, so that the scans match one to one."""
+    points = street.scan(street.pose(), noise_m=0.01).points
+    points = points[one_per_voxel(points, 0.25, np.random.default_rng(0))]
+    crowded = cKDTree(points).query_pairs(0.36, output_type="ndarray")
+    points = np.delete(points, np.unique(crowded[:, 1]), axis=0)
+    cfg = PreprocessConfig(point_voxel_m=0.2, max_points=len(points), ground_share=1.0)
+    here, there = (valid_rows(preprocess(cloud, cfg)) for cloud in (points, points @ rotation_z(yaw).T))
+    assert len(here[0]) > 2000
+    gap, match = cKDTree(there[0]).query(here[0] @ rotation_z(yaw).T)
+    same = gap < 1e-3  # float32 flips a neighbour at the rim, a voxel or a verdict now and then
+    assert same.mean() > 0.99
+    change = np.abs(here[2][same] - there[2][match[same]]).max(axis=1)
+    assert np.mean(change < 0.02) > 0.98
+    turned = np.abs(np.sum((here[1][same] @ rotation_z(yaw).T) * there[1][match[same]], axis=1))
+    assert np.mean(turned > 0.999) > 0.98
+
+
+def test_key_points_are_upright_near_and_thinned():
+    """Oracle: the config, counted voxel by voxel."""
+    scan = preprocess(street.scan(street.pose()).points, CFG)
+    rows = scan.keypoint_index[scan.keypoint_mask]
+    assert len(rows) > 100
+    assert np.all(np.abs(scan.normals[rows, 2]) < HORIZONTAL)
+    assert np.all(np.linalg.norm(scan.points[rows], axis=1) < CFG.keypoint_range_m)
+    voxels = {tuple(np.floor(point.astype(np.float64) / CFG.keypoint_voxel_m)) for point in scan.points[rows]}
+    assert len(voxels) == len(rows)
+
+
+def test_ground_keeps_to_its_share():
+    """Oracle: the config, on a street that fills a small scan with ground and walls."""
+    cfg = PreprocessConfig(max_points=500, num_keypoints=64, ground_share=0.3, point_voxel_m=0.5)
+    scan = preprocess(street.scan(street.pose()).points, cfg)
+    assert scan.mask.all()
+    assert np.sum(np.abs(scan.normals[:, 2]) > HORIZONTAL) == int(0.3 * 500)
+    flat = preprocess(street.scan(street.pose(), boxes=[]).points, cfg)
+    assert flat.mask.sum() == int(0.3 * 500)  # nothing but ground
+    assert not flat.keypoint_mask.any()
+
+
+def test_range_is_cropped():
+    """Oracle: the config; a mean of voxels and a projection move a point by centimetres."""
+    cfg = PreprocessConfig(min_range_m=8.0, max_range_m=30.0)
+    points, _, _ = valid_rows(preprocess(street.scan(street.pose()).points, cfg))
+    ranges = np.linalg.norm(points, axis=1)
+    assert ranges.min() > 7.9
+    assert ranges.max() < 30.1
+
+
+def test_first_rows_are_an_even_subset():
+    """Oracle: a two-sample Kolmogorov-Smirnov test of azimuth, range and height of the first rows against the others."""
+    points, _, _ = valid_rows(preprocess(street.scan(street.pose()).points, CFG))
+    for values in (np.arctan2(points[:, 1], points[:, 0]), np.linalg.norm(points, axis=1), points[:, 2]):
+        assert ks_2samp(values[:512], values[512:]).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_voxel_mean_is_the_mean_of_each_voxel(seed):
+    """Oracle: a dictionary of lists, in float64."""
+    points = (np.random.default_rng(seed).normal(size=(500, 3)) * [3, 3, 1]).astype(np.float32)
+    cells = defaultdict(list)
+    for point in points:
+        cells[tuple(np.floor(point * np.float32(1 / 0.7)))].append(point.astype(np.float64))
+    expected = np.array(sorted(tuple(np.mean(cell, axis=0)) for cell in cells.values()))
+    found = voxel_mean(points, 0.7)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(sorted(map(tuple, found)), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_point_is_kept_of_each_voxel(seed):
+    """Oracle: the set of occupied voxels, point by point; the choice within a voxel is random."""
+    points = (np.random.default_rng(seed).normal(size=(500, 3)) * [3, 3, 1]).astype(np.float32)
+    cells = [tuple(np.floor(point * np.float32(1 / 0.7))) for point in points]
+    rows = one_per_voxel(points, 0.7, np.random.default_rng(seed))
+    assert len(rows) == len({cells[row] for row in rows}) == len(set(cells))
+    assert not np.array_equal(rows, one_per_voxel(points, 0.7, np.random.default_rng(seed + 1)))
