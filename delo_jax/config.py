@@ -120,13 +120,13 @@ class StatusConfig:
     """A pair off by more than this is lost."""
     lost_rotation_deg: float = 2.0
     """A pair off by more than this is lost."""
-    ok_confidence: float = 0.5
+    ok_confidence: float = 0.8
     """Below this confidence a pair is `low_confidence`."""
-    rejected_confidence: float = 0.05
+    rejected_confidence: float = 0.2
     """Below this confidence a pair is `rejected`."""
     min_points: int = 100
     """A scan with fewer usable points is `rejected`."""
-    min_observability: float = 1e-3
+    min_observability: float = 3e-3
     """Smallest share of the weighted normals that must point along every direction, else `degenerate`."""
     unknown_rotation_deg: float = 30.0
     """Standard deviation of a pose nobody measured."""
@@ -174,9 +174,9 @@ class TrainConfig:
     """Scenes of unseen seeds for validation."""
     num_frames: int = 6
     """Scans per scene, so gaps 1 to num_frames - 1."""
-    num_steps: int = 4000
+    num_steps: int = 3000
     """Optimiser steps of matching and pose."""
-    num_evidence_steps: int = 600
+    num_evidence_steps: int = 1200
     """Optimiser steps of the evidence head, on the finished solver."""
     batch_size: int = 8
     """Pairs per step."""

@@ -12,6 +12,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 
@@ -40,7 +42,8 @@ def parser(doc: str | None, *, needs_data: bool) -> argparse.ArgumentParser:
     result.add_argument("--json", type=Path, help="also write the rows, settings, commit and device here")
     if needs_data:
         default = os.environ.get("DELO_DATA")
-        result.add_argument("--data", type=Path, default=default, required=default is None, help="tree of real sequences; default $DELO_DATA")
+        text = "tree of real sequences; default $DELO_DATA"
+        result.add_argument("--data", type=Path, default=default, required=default is None, help=text)
     return result
 
 
@@ -61,12 +64,17 @@ def finish(rows: list[Row], settings: Any, args: argparse.Namespace) -> int:
     return 0 if args.quick or not missed else 1
 
 
-def progress() -> Progress:
-    """A bar with count, rate and time left, on stderr, so that stdout holds the tables alone."""
-    from rich.console import Console
+def needed(value: np.ndarray | None, what: str) -> np.ndarray:
+    """The value; ends the script with a sentence where the data tree lacks it."""
+    if value is None:
+        sys.exit(f"{what}: expected in the data tree, got none; check --data")
+    return value
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.speed:.1f}/s"), TimeRemainingColumn()
-    return Progress(*columns[:3], columns[4], console=Console(file=sys.stderr))
+
+def progress() -> Progress:
+    """A bar with count and time left, on stderr, so that stdout holds the tables alone."""
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    return Progress(*columns, console=Console(file=sys.stderr))
 
 
 def device() -> str:

@@ -113,7 +113,8 @@ def gicp_motions(gicp: Gicp, count: int) -> list[np.ndarray]:
 def load(data: Path, name: str):
     """Scans (elevation-corrected) and the two truths, T_first_lidar, of a sequence."""
     dataset = delo_jax.open_dataset(data / "sequences" / name)
-    poses = [camera_to_lidar(read_kitti_poses(data / folder / f"{name}.txt"), dataset.T_cam_lidar) for folder in ("poses_boresight", "poses")]
+    T_cam_lidar = _harness.needed(dataset.T_cam_lidar, "Tr in calib.txt")
+    poses = [camera_to_lidar(read_kitti_poses(data / folder / f"{name}.txt"), T_cam_lidar) for folder in ("poses_boresight", "poses")]
     print(f"\n## {name}: {len(dataset)} scans, elevation + {dataset.elevation_correction_deg:g} deg, no de-skew\n")
     return [dataset[index].points for index in range(len(dataset))], *poses
 
@@ -165,8 +166,8 @@ def other_sensors(data: Path, params) -> list[Row]:
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, :3] = np.loadtxt(data / "ouster_street" / "poses.txt").reshape(-1, 3, 4)
     pairs = [(f"ouster_street {k} to {k + 1}", ouster[k].points, ouster[k + 1].points, relative(poses, 1, 2)[k], 0.3) for k in range(2)]
-    clouds = [delo_jax.read_scan(data / "pairs" / f"hdl32_{role}.bin").points for role in ("source", "target")]
-    pairs.append(("hdl32", *clouds, np.loadtxt(data / "pairs" / "hdl32_T_target_source.txt").reshape(-1, 4)[:4], 0.5))
+    source, target = (delo_jax.read_scan(data / "pairs" / f"hdl32_{role}.bin").points for role in ("source", "target"))
+    pairs.append(("hdl32", source, target, np.loadtxt(data / "pairs" / "hdl32_T_target_source.txt"), 0.5))
     for name, source, target, true, bound_deg in pairs:
         estimate = delo_jax.odometry(params, source, target)
         errors = Errors.of([estimate.T_target_source], true[None])

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from delo_jax.cli.command import Command
 from delo_jax.errors import DeloError
 
-PACKAGES = ("jax", "numpy", "scipy", "flax", "safetensors", "matplotlib", "small_gicp", "gtsam")
+PACKAGES = ("jax", "numpy", "scipy", "flax", "safetensors", "matplotlib", "gtsam")
 BOUND_CM, BOUND_DEG = 5.0, 0.3  # of the self-test, about twice what range noise alone leaves
 NUM_TIMED = 10
 

@@ -15,14 +15,13 @@ from delo_jax.model.coarse import CoarsePose, coarse_pose
 from delo_jax.model.dgcnn import EdgeEncoder
 from delo_jax.model.evidential import EvidenceHead
 from delo_jax.model.matching import Temperature
+from delo_jax.model.statistics import NUM_STATISTICS, consensus, statistics
 from delo_jax.ops import evidence
 from delo_jax.ops.knn import knn
 from delo_jax.ops.transport import matching_cost
 
 full_float32 = jax.default_matmul_precision("highest")
 NUM_FEATURES = 8
-NUM_STATISTICS = 24
-LEVER_M = 15.0  # a rotation moves the scene by about this arm; makes rotations and translations comparable
 
 
 class Network(nn.Module):
@@ -195,56 +194,6 @@ def _first(cloud: fine.Cloud, num: int) -> fine.Cloud:
     return jax.tree.map(lambda array: array[:num], cloud)
 
 
-def consensus(matches: fine.Matches) -> Float[Array, ""]:
-    """Share of the source points that lie on a target surface of the same orientation, in [0, 1].
-
-    The learned confidences have no say: they leave out what does not fit, and would call a street that slid along
-    itself a perfect match.
-    """
-    valid = matches.weights > 0.0
-    squared = jnp.sum((matches.points - matches.targets) ** 2, axis=1)
-    fit = jnp.maximum(matches.agreement, 0.0) ** 2 / (1.0 + (matches.plane_distance / 0.1) ** 2) / (1.0 + squared)
-    return jnp.sum(jnp.where(valid, fit, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
-
-
 def _direction_spread(matches: fine.Matches) -> Float[Array, "3 3"]:
     w = (matches.weights / (jnp.sum(matches.weights) + 1e-6))[:, None]
     return (w * matches.normals).T @ matches.normals
-
-
-def statistics(matches, information, T, T_delta, disagreement, inlier_share, other_score) -> Float[Array, " s"]:
-    """What the solver knows about its own answer, as numbers of order one; the input of the evidence head."""
-    valid = matches.weights > 0.0
-    num_valid = jnp.sum(valid)
-    distance = jnp.abs(matches.plane_distance)
-    weight = jnp.sum(matches.weights) + 1e-6
-    rms = jnp.sqrt(jnp.sum(matches.weights * distance**2) / weight)
-    quantiles = _quantiles(distance, valid, jnp.array([0.25, 0.5, 0.75, 0.9]))
-    agreement = jnp.sum(jnp.where(valid, matches.agreement, 0.0)) / jnp.maximum(num_valid, 1)
-    scale = jnp.repeat(jnp.array([1.0 / LEVER_M, 1.0]), 3)
-    eigenvalues = jnp.linalg.eigvalsh(information * scale[:, None] * scale[None, :]) / weight
-    lengths = jnp.stack([length for pose in (T_delta, disagreement, T) for length in _lengths(pose)])
-    score = consensus(matches)
-    return jnp.concatenate(
-        [
-            jnp.stack([weight / matches.weights.shape[0], score, other_score, score - other_score]) * 3.0,
-            jnp.log10(jnp.append(quantiles, rms) + 1e-3) + 1.0,
-            jnp.log10(jnp.maximum(eigenvalues, 1e-6)) + 1.0,
-            jnp.log10(lengths + 1e-4) + 1.0,
-            jnp.stack([inlier_share * 2.0, agreement, num_valid / 1000.0]),
-        ]
-    )
-
-
-def _quantiles(values: Float[Array, " n"], valid: Bool[Array, " n"], shares: Float[Array, " q"]) -> Float[Array, " q"]:
-    """Quantiles of the valid values, linear between two of them; 0 when none is valid."""
-    ordered = jnp.sort(jnp.where(valid, values, jnp.inf))
-    last = jnp.maximum(jnp.sum(valid) - 1, 0)
-    place = shares * last
-    low = jnp.floor(place).astype(jnp.int32)
-    below, above = ordered[low], ordered[jnp.minimum(low + 1, last)]
-    return jnp.where(jnp.any(valid), below + (place - low) * (above - below), 0.0)
-
-
-def _lengths(T: Float[Array, "4 4"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    return jnp.sqrt(jnp.sum(T[:3, 3] ** 2) + 1e-12), LEVER_M * se3.rotation_angle(T[:3, :3])

@@ -5,7 +5,7 @@ import logging
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from delo_jax.train.worlds import World, worlds
 log = logging.getLogger(__name__)
 
 
+@runtime_checkable
 class Reporter(Protocol):
     """Where progress goes; the command line draws bars."""
 
@@ -54,11 +55,11 @@ def train(cfg: TrainConfig, out: Path, reporter: Reporter) -> tuple[delo.Model, 
     Returns:
         The model and its errors on the validation worlds.
     """
-    reporter.start("simulating training worlds", cfg.num_scenes)
-    training = list(worlds(cfg, out / "worlds", validation=False, on_world=reporter.advance))
-    reporter.start("simulating validation worlds", cfg.num_validation_scenes)
-    held_out = list(worlds(cfg, out / "worlds", validation=True, on_world=reporter.advance))
     with Checkpoints(out / "checkpoints", cfg) as checkpoints:
+        reporter.start("simulating training worlds", cfg.num_scenes)
+        training = list(worlds(cfg, out / "worlds", validation=False, on_world=reporter.advance))
+        reporter.start("simulating validation worlds", cfg.num_validation_scenes)
+        held_out = list(worlds(cfg, out / "worlds", validation=True, on_world=reporter.advance))
         params = delo.init(cfg.model, jax.random.key(cfg.seed)).variables
         first = 0
         for phase_cfg, num_steps in phases(cfg):
@@ -88,7 +89,8 @@ def _run_phase(cfg, num_steps, first, params, training, held_out, checkpoints, r
                 checkpoints.save(done, state)
                 reporter.validated(done, validate(delo.Model(state.params, cfg.model), held_out))
     except KeyboardInterrupt:
-        checkpoints.save(done, state)
+        if not any(leaf.is_deleted() for leaf in jax.tree.leaves(state)):  # else it came within a step, which had taken the old state
+            checkpoints.save(int(state.step), state)
         raise
     return state.params
 

@@ -19,7 +19,9 @@ def from_evidence(nu: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> Uncert
     """Moments of the normal-inverse-gamma prediction; the covariance is the diagonal of their sum, not calibrated.
 
     Args:
-        nu, alpha, beta: (6,) each, beta in rad^2 and m^2.
+        nu: (6,) virtual observations of the mean.
+        alpha: (6,) shape of the variance, above 1.
+        beta: (6,) scale of the variance [rad^2, m^2].
     """
     aleatoric = beta / (alpha - 1.0)
     epistemic = aleatoric / nu

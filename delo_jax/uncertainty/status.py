@@ -44,7 +44,7 @@ def judge(
     if confidence < cfg.rejected_confidence:
         return Health("rejected", f"confidence {confidence:.2f} is below {cfg.rejected_confidence:g}", confidence)
     if observability[0] < cfg.min_observability:
-        axis = "forward lateral vertical".split()[int(np.argmax(np.abs(weakest_axis)))]
+        axis = ["forward", "lateral", "vertical"][int(np.argmax(np.abs(weakest_axis)))]
         return Health("degenerate", f"hardly any surface holds the {axis} direction ({observability[0]:.4f})", confidence)
     if confidence < cfg.ok_confidence:
         return Health("low_confidence", f"confidence {confidence:.2f} is below {cfg.ok_confidence:g}", confidence)

@@ -1,0 +1,76 @@
+"""Time of every stage of one scan-to-scan step, on full simulated HDL-64E scans; compilation apart.
+
+Run:     python benchmarks/latency.py [--quick]        (about a minute on 2 cores)
+
+Timings are medians and tails of single calls, results awaited, transfers to and from the device included. N source points are
+solved for, M target points are kept, K key points are matched.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+
+import jax
+import numpy as np
+
+import delo_jax
+from delo_jax import inference
+from delo_jax.preprocess import preprocess
+from delo_jax.sim import simulate_drive
+
+WARM_UP, NUM_SCANS = 20, 200
+
+
+def compile_seconds(params, points: np.ndarray) -> float:
+    """First call of everything, which compiles."""
+    begin = time.perf_counter()
+    delo_jax.odometry(params, points, points)
+    return time.perf_counter() - begin
+
+
+def timed(function: Callable, *args) -> tuple[object, float]:
+    """Result and milliseconds of a call, until the result is there."""
+    begin = time.perf_counter()
+    result = jax.block_until_ready(function(*args))
+    return result, 1e3 * (time.perf_counter() - begin)
+
+
+def measure(params, scans: list[np.ndarray], num_scans: int) -> dict[str, list[float]]:
+    """Milliseconds per stage and scan; the older scan of each pair is encoded already, as in a stream."""
+    times: dict[str, list[float]] = {"preprocess": [], "encode": [], "align": [], "total": []}
+    source = inference.prepare(params, scans[0])
+    for k in range(WARM_UP + num_scans):
+        scan, preprocess_ms = timed(preprocess, scans[(k + 1) % len(scans)], params.cfg.preprocess)
+        encoding, encode_ms = timed(inference.encode, params, scan)
+        target = inference.EncodedScan(encoding, int(scan.mask.sum()))
+        _, align_ms = timed(inference.align, params, source, target, np.eye(4))
+        source = target
+        if k >= WARM_UP:
+            for name, value in zip(times, (preprocess_ms, encode_ms, align_ms, preprocess_ms + encode_ms + align_ms), strict=True):
+                times[name].append(value)
+    return times
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="20 scans instead of 200")
+    parser.add_argument("--weights", default="delo-base", help="name or file")
+    args = parser.parse_args(argv)
+    params = delo_jax.load(args.weights)
+    scans = [scan.points for scan in simulate_drive("mixed", 3, 8)]
+    compiled = compile_seconds(params, scans[0])
+    times = measure(params, scans, 20 if args.quick else NUM_SCANS)
+    cfg = params.cfg
+    print(f"N = {cfg.fine.num_points}, M = {cfg.preprocess.max_points}, K = {cfg.preprocess.num_keypoints}; {len(scans[0])} points a scan")
+    print(f"JAX {jax.__version__} on {jax.devices()[0].device_kind}, delo-jax {version('delo-jax')}; first call {compiled:.1f} s\n")
+    print("| stage | p50 ms | p95 ms | p99 ms |\n|---|---:|---:|---:|")
+    for name, values in times.items():
+        print(f"| {name} | " + " | ".join(f"{value:.1f}" for value in np.percentile(values, (50, 95, 99))) + " |")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

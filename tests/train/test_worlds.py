@@ -1,0 +1,92 @@
+"""Worlds on disk: made once, told apart by what they were made from."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from delo_jax.config import PreprocessConfig
+from delo_jax.preprocess import preprocess
+from delo_jax.sim import KINDS
+from delo_jax.train import worlds as module
+from delo_jax.train.worlds import worlds
+from tests.fixtures import TINY_TRAINING
+from tests.oracles import street
+
+CFG = dataclasses.replace(TINY_TRAINING, num_scenes=7, num_validation_scenes=2, num_frames=2)
+
+
+@pytest.fixture
+def simulator(monkeypatch):
+    """Stands in for the simulator: the street from poses that depend on the seed; remembers its calls."""
+    calls = []
+
+    def simulate_clip(kind, seed, *, num_frames, sensor):
+        calls.append((kind, seed, sensor))
+        poses = [street.pose(0.001 * (seed % 1000) + k) for k in range(num_frames)]
+        return [SimpleNamespace(points=street.scan(T, num_rings=8, num_columns=180).points, T_world_lidar=T) for T in poses]
+
+    monkeypatch.setattr(module, "simulate_clip", simulate_clip)
+    return calls
+
+
+def test_worlds_are_simulated_once_and_read_back(simulator, tmp_path):
+    """Oracle: the scans preprocessed by hand; normals and features are kept in half precision."""
+    progress = []
+    first = list(worlds(CFG, tmp_path, validation=False, on_world=lambda: progress.append(1)))
+    assert (len(first), len(progress), len(simulator)) == (7, 7, 7)
+    again = list(worlds(CFG, tmp_path, validation=False))
+    assert len(simulator) == 7
+    for index, (world, read) in enumerate(zip(first, again, strict=True)):
+        assert all(a.tobytes() == b.tobytes() for a, b in zip(world.scans, read.scans, strict=True))
+        for frame in range(2):
+            T = street.pose(0.001 * index + frame)
+            np.testing.assert_array_equal(world.Ts_world_lidar[frame], T)
+            expected = preprocess(street.scan(T, num_rings=8, num_columns=180).points, CFG.model.preprocess)
+            for name, array in expected._asdict().items():
+                found = getattr(world.scans, name)[frame]
+                assert found.dtype == array.dtype
+                np.testing.assert_allclose(found, array, **({"rtol": 1e-3, "atol": 1e-3} if name in ("normals", "features") else {}))
+
+
+def test_kinds_take_turns_and_validation_is_apart(simulator, tmp_path):
+    """Oracle: the list of kinds; no seed of a validation world is one of a training world."""
+    list(worlds(CFG, tmp_path, validation=False))
+    training = simulator.copy()
+    simulator.clear()
+    list(worlds(CFG, tmp_path, validation=True))
+    assert [kind for kind, _, _ in training] == [KINDS[index % len(KINDS)] for index in range(7)]
+    assert len(simulator) == 2
+    assert not {seed for _, seed, _ in training} & {seed for _, seed, _ in simulator}
+    assert min(seed for _, seed, _ in simulator) >= module.VALIDATION_SEED
+
+
+def test_interrupted_run_goes_on(simulator, tmp_path):
+    """Oracle: the calls of the simulator; what was written stays, half a file does not count."""
+    whole = list(worlds(CFG, tmp_path, validation=False))
+    files = sorted(tmp_path.iterdir())
+    files[4].rename(files[4].with_suffix(".part"))
+    files[5].unlink()
+    simulator.clear()
+    again = list(worlds(CFG, tmp_path, validation=False))
+    assert len(simulator) == 2
+    assert all(a.tobytes() == b.tobytes() for one, other in zip(whole, again, strict=True) for a, b in zip(one.scans, other.scans, strict=True))
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"seed": 1},
+        {"num_frames": 3},
+        {"model": dataclasses.replace(CFG.model, preprocess=PreprocessConfig(max_points=100, num_keypoints=32))},
+    ],
+)
+def test_worlds_of_another_making_are_not_mixed_up(simulator, tmp_path, changed):
+    """Oracle: the calls of the simulator; other frames, seed or preprocessing are made anew, another learning rate is not."""
+    list(worlds(CFG, tmp_path, validation=False))
+    simulator.clear()
+    list(worlds(dataclasses.replace(CFG, learning_rate=1e-5, num_steps=1), tmp_path, validation=False))
+    assert len(simulator) == 0
+    list(worlds(dataclasses.replace(CFG, **changed), tmp_path, validation=False))
+    assert len(simulator) == 7
