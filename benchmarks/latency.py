@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from importlib.metadata import version
+from typing import Any
 
 import jax
 import numpy as np
@@ -30,7 +31,7 @@ def compile_seconds(params, points: np.ndarray) -> float:
     return time.perf_counter() - begin
 
 
-def timed(function: Callable, *args) -> tuple[object, float]:
+def timed(function: Callable, *args) -> tuple[Any, float]:
     """Result and milliseconds of a call, until the result is there."""
     begin = time.perf_counter()
     result = jax.block_until_ready(function(*args))

@@ -43,13 +43,14 @@ class Estimate:
 
     def inverted(self) -> "Estimate":
         """The same estimate of the inverse pose, `T_source_target`, covariance carried through the adjoint."""
-        Ad2 = se3.adjoint(self.T_target_source) ** 2  # of independent axes: variances go through the squares
+        covariance_inverse = se3.invert_covariance(self.covariance, self.T_target_source)
+        aleatoric = se3.adjoint(self.T_target_source) ** 2 @ self.aleatoric  # of independent axes
         return dataclasses.replace(
             self,
             T_target_source=se3.inverse(self.T_target_source),
-            covariance=se3.invert_covariance(self.covariance, self.T_target_source),
-            aleatoric=Ad2 @ self.aleatoric,
-            epistemic=Ad2 @ self.epistemic,
+            covariance=covariance_inverse,
+            aleatoric=aleatoric,
+            epistemic=np.diag(covariance_inverse) - aleatoric,
         )
 
 
@@ -92,6 +93,8 @@ def align(params: delo.Model, source: EncodedScan, target: EncodedScan, T_target
     else:
         nig = [np.asarray(value, np.float64) for value in result.nig]
         T, known = se3.exp(se3.log(np.asarray(result.T_target_source, np.float64))), covariance.from_evidence(*nig[1:])
+    if health.status == "degenerate":
+        known = covariance.widen_along(known, T[:3, :3].T @ result.weakest_axis, limits)
     return Estimate(
         T_target_source=T,
         covariance=known.covariance,

@@ -1,4 +1,4 @@
-"""Small shared problems: a tiny network, pairs of the analytic street, one simulated clip. Made once per session."""
+"""Small problems for many tests: a tiny network, pairs of the analytic street, one simulated clip. Made once per session."""
 
 import dataclasses
 import functools
@@ -63,9 +63,10 @@ def street_scan(frame: int) -> Scan:
 def dirty(scan, seed=0):
     """The scan with garbage in its padding."""
     rng = np.random.default_rng(seed)
-    fill = [np.where(scan.mask[:, None], a, 50 * rng.normal(size=a.shape)).astype(np.float32) for a in scan[:3]]
+    garbage = {name: 50 * rng.normal(size=array.shape) for name, array in scan._asdict().items() if array.ndim == 2}
+    filled = {name: np.where(scan.mask[:, None], getattr(scan, name), array).astype(np.float32) for name, array in garbage.items()}
     index = np.where(scan.keypoint_mask, scan.keypoint_index, rng.integers(0, len(scan.mask), len(scan.keypoint_index)))
-    return Scan(*fill, scan.mask, index.astype(np.int32), scan.keypoint_mask)
+    return scan._replace(**filled, keypoint_index=index.astype(np.int32))
 
 
 def thinned(scan, num_points, num_keypoints):
@@ -73,7 +74,8 @@ def thinned(scan, num_points, num_keypoints):
     keypoint_mask = np.arange(len(scan.keypoint_mask)) < num_keypoints
     index = np.where(keypoint_mask, scan.keypoint_index % num_points, 0).astype(np.int32)
     mask = np.arange(len(scan.mask)) < num_points
-    return Scan(*(np.where(mask[:, None], a, 0).astype(np.float32) for a in scan[:3]), mask, index, keypoint_mask)
+    points, normals, features = (np.where(mask[:, None], array, 0).astype(np.float32) for array in scan[:3])
+    return Scan(points, normals, features, mask, index, keypoint_mask)
 
 
 def T_street() -> np.ndarray:

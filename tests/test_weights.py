@@ -42,9 +42,7 @@ def read_safetensors(data):
     header, body = json.loads(data[8 : 8 + length]), data[8 + length :]
     header.pop("__metadata__", None)
     assert {entry["dtype"] for entry in header.values()} == {"F32"}
-    return {
-        name: np.frombuffer(body[slice(*entry["data_offsets"])], "<f4").reshape(entry["shape"]) for name, entry in header.items()
-    }
+    return {name: np.frombuffer(body[slice(*entry["data_offsets"])], "<f4").reshape(entry["shape"]) for name, entry in header.items()}
 
 
 def test_round_trip_keeps_every_bit(stored):

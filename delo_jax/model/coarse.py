@@ -45,9 +45,7 @@ def coarse_pose(
     Returns:
         The planar pose and the share of matches that fit it.
     """
-    plan = partial_transport(
-        cost, jnp.ones(()), mass=cfg.mass, num_iters=cfg.num_iters, row_mask=source_mask, column_mask=target_mask
-    )
+    plan = partial_transport(cost, jnp.ones(()), mass=cfg.mass, num_iters=cfg.num_iters, row_mask=source_mask, column_mask=target_mask)
     best = jnp.argmax(plan, axis=1)
     strength = jnp.max(plan, axis=1) * jnp.sum(source_mask)
     matched = target[best]

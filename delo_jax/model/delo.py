@@ -111,7 +111,7 @@ def init(cfg: DeloConfig, key: Key[Array, ""]) -> Model:
     points, features = jnp.zeros((4, 3)), jnp.zeros((4, NUM_FEATURES))
     geometry, _, _ = fine.match_geometry(points, points, points, points, jnp.ones(4, bool))
     variables = Network(cfg).init(key, points, features, geometry, jnp.zeros(NUM_STATISTICS), method="everything")
-    return Model(variables, cfg)
+    return Model(dict(variables), cfg)
 
 
 def encode(model: Model, scan) -> Encoding:
@@ -132,9 +132,7 @@ def matching_scores(model: Model, source: Encoding, target: Encoding) -> Float[A
 def coarse(model: Model, source: Encoding, target: Encoding) -> CoarsePose:
     """Pose with no prior, from the key points alone."""
     cost = matching_cost(source.descriptors, target.descriptors, model.apply("temperature"), target.keypoint_mask)
-    return coarse_pose(
-        cost, source.keypoints, target.keypoints, source.keypoint_mask, target.keypoint_mask, cfg=model.cfg.coarse
-    )
+    return coarse_pose(cost, source.keypoints, target.keypoints, source.keypoint_mask, target.keypoint_mask, cfg=model.cfg.coarse)
 
 
 def refine_pose(model: Model, source: fine.Cloud, target: fine.Cloud, T_init, *, num_iters: int) -> Float[Array, "t 4 4"]:
@@ -174,7 +172,7 @@ def solve(model: Model, source: Encoding, target: Encoding, T_init: Float[Array,
     stats = statistics(matches, information, T, T_delta, disagreement, first.inlier_share, scores[1 - best])
     nig, success_logit = predict_evidence(model, stats)
     values, vectors = jnp.linalg.eigh(_direction_spread(matches))
-    finite = jnp.all(jnp.isfinite(T)) & jnp.all(jnp.isfinite(stats))
+    finite = jnp.all(jnp.isfinite(T)) & jnp.all(jnp.isfinite(stats)) & jnp.all(jnp.isfinite(values))
     return Registration(T, information, nig, nn.sigmoid(success_logit), stats, values, vectors[:, 0], best == 1, finite)
 
 

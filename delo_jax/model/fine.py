@@ -119,9 +119,7 @@ def match(confidence: Confidence, source: Cloud, target: Cloud, T_target_source:
 
 def step(matches: Matches, *, cfg: FineConfig) -> tuple[Float[Array, "4 4"], Float[Array, "6 6"]]:
     """Weighted point-to-plane step and information matrix (about a left twist in the target frame)."""
-    return point_to_plane_step(
-        matches.points, matches.targets, matches.normals, matches.weights, matches.tangential, damping=cfg.damping
-    )
+    return point_to_plane_step(matches.points, matches.targets, matches.normals, matches.weights, matches.tangential, damping=cfg.damping)
 
 
 @full_float32

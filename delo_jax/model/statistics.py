@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from delo_jax.geometry import se3
+from delo_jax.geometry.se3 import AnyArray
 from delo_jax.model import fine
 
 LEVER_M = 15.0  # a rotation moves the scene by about this arm; makes rotations and translations comparable
@@ -66,7 +67,7 @@ def statistics(matches, information, T, T_delta, disagreement, inlier_share, oth
     num_valid = jnp.sum(valid)
     distance = jnp.abs(matches.plane_distance)
     weight = jnp.sum(matches.weights) + 1e-6
-    rms = jnp.sqrt(jnp.sum(matches.weights * distance**2) / weight)
+    rms = jnp.sqrt(jnp.sum(matches.weights * distance**2) / weight + 1e-12)
     quantiles = _quantiles(distance, valid, jnp.array([0.25, 0.5, 0.75, 0.9]))
     agreement = jnp.sum(jnp.where(valid, matches.agreement, 0.0)) / jnp.maximum(num_valid, 1)
     scale = jnp.repeat(jnp.array([1.0 / LEVER_M, 1.0]), 3)
@@ -96,5 +97,5 @@ def _quantiles(values: Float[Array, " n"], valid: Bool[Array, " n"], shares: Flo
     return jnp.where(jnp.any(valid), below + (place - low) * (above - below), 0.0)
 
 
-def _lengths(T: Float[Array, "4 4"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _lengths(T: Float[Array, "4 4"]) -> tuple[AnyArray, AnyArray]:
     return jnp.sqrt(jnp.sum(T[:3, 3] ** 2) + 1e-12), LEVER_M * se3.rotation_angle(T[:3, :3])

@@ -17,6 +17,7 @@ from delo_jax.pipeline.trajectory import Trajectory
 from delo_jax.preprocess import check_points
 from delo_jax.uncertainty import covariance
 
+MAX_SWEEP_S = 1.0  # a point measured farther from the stamp has a time of another kind
 DEFAULT_PERIOD_NS = 100_000_000  # when no stamps are given: 10 scans a second
 
 
@@ -88,6 +89,10 @@ class LidarOdometry:
         stamp_ns = self._check_stamp(stamp_ns)
         if times_s is not None and np.shape(times_s) != (len(points),):
             raise ScanError(f"times_s: expected one time per point, shape ({len(points)},), got {np.shape(times_s)}")
+        if times_s is not None and np.any(np.abs(times_s) > MAX_SWEEP_S):
+            raise ScanError(
+                f"times_s: expected seconds relative to the stamp, within {MAX_SWEEP_S:g} s, got {np.nanmax(np.abs(times_s)):g} s"
+            )
         begin = time.perf_counter()
         times_s = times_s if self._deskew else None
         target = Source(self._prepare_at(points, times_s), points, times_s, stamp_ns)

@@ -30,7 +30,9 @@ def true_matches(
     return jnp.where(possible, jnp.exp(-0.5 * squared / MATCH_SIGMA_M**2), 0.0)
 
 
-def matching_loss(scores: Float[Array, "n m"], matches: Float[Array, "n m"], source_mask: Bool[Array, " n"], target_mask: Bool[Array, " m"]):
+def matching_loss(
+    scores: Float[Array, "n m"], matches: Float[Array, "n m"], source_mask: Bool[Array, " n"], target_mask: Bool[Array, " m"]
+):
     """Cross-entropy of the scores' row and column softmax against the soft true matches; rows without one do not count."""
     valid = source_mask[:, None] & target_mask[None, :]
     masked = jnp.where(valid, scores, -1e9)

@@ -34,8 +34,14 @@ def unknown(cfg: StatusConfig) -> Uncertainty:
     return Uncertainty(np.zeros(6), sigma**2, np.diag(sigma**2))
 
 
-def widen(known: Uncertainty, cfg: StatusConfig) -> Uncertainty:
-    """The same uncertainty, but nowhere smaller than that of a pose nobody measured."""
-    floor = unknown(cfg).epistemic
-    epistemic = np.maximum(known.epistemic, floor - known.aleatoric)
-    return Uncertainty(known.aleatoric, epistemic, np.diag(known.aleatoric + epistemic))
+def widen_along(known: Uncertainty, direction: np.ndarray, cfg: StatusConfig) -> Uncertainty:
+    """The same uncertainty plus that of an unmeasured translation along one direction.
+
+    Args:
+        known: uncertainty of a pose.
+        direction: (3,) unit vector in the frame of the perturbation, the source frame for T_target_source.
+        cfg: standard deviation of a translation that nobody measured.
+    """
+    extra = np.zeros((6, 6))
+    extra[3:, 3:] = cfg.unknown_translation_m**2 * np.outer(direction, direction)
+    return Uncertainty(known.aleatoric, known.epistemic + np.diag(extra), known.covariance + extra)

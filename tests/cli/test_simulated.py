@@ -119,8 +119,8 @@ def test_train(cli, monkeypatch, tmp_path, weights_file):
     assert "loss 0.500" in done.err
     card = weights.read_card(tmp_path / "delo-base.safetensors")
     assert card["license"] == "MIT"
-    assert card["metrics_on_unseen_worlds"][0]["lost_share"] == 0.025
-    assert card["command"] == f"delo train base --out {tmp_path}"
+    assert card["metrics"][0]["lost_share"] == 0.025
+    assert card["commands"] == [f"delo train base --out {tmp_path}"]
     weights.load(tmp_path / "delo-base.safetensors")
 
 

@@ -84,22 +84,22 @@ def test_descriptors_match_a_loop_in_float64():
     model = tiny_model()
     found = encode(model, scan).descriptors
     params = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), model.variables["params"]["encoder"])
-    rows = scan.keypoint_index[:30]
-    points, features = scan.points[rows].astype(np.float64), np.hstack([scan.normals[rows], scan.features[rows]]).astype(np.float64)
+    kept = scan.keypoint_index[:30]
+    points, features = scan.points[kept].astype(np.float64), np.hstack([scan.normals[kept], scan.features[kept]]).astype(np.float64)
     neighbors = [np.argsort(np.linalg.norm(points - p, axis=1))[: TINY.coarse.num_neighbors] for p in points]
-    index = np.asarray(knn(jnp.asarray(scan.points[rows]), jnp.ones(30, bool), TINY.coarse.num_neighbors))
+    index = np.asarray(knn(jnp.asarray(scan.points[kept]), jnp.ones(30, bool), TINY.coarse.num_neighbors))
     assert [set(row) for row in index] == [set(row) for row in neighbors]
     levels = [features]
     for level in range(3):
         p, norm = params[f"edge_conv_{level}"], params[f"norm_{level}"]
         h = levels[-1]
-        new = []
+        rows = []
         for i, near in enumerate(neighbors):
             center = h[i] @ p["center"]["kernel"] + p["center"]["bias"]
             edges = [h[j] @ p["neighbor"]["kernel"] + center + (points[j] - points[i]) / 4.0 @ p["edge"]["kernel"] for j in near]
             hidden = np.maximum(np.array(edges), 0) @ p["out"]["kernel"] + p["out"]["bias"]
-            new.append(np.maximum(hidden.max(axis=0), 0))
-        new = np.array(new)
+            rows.append(np.maximum(hidden.max(axis=0), 0))
+        new = np.array(rows)
         new = (new - new.mean(axis=1, keepdims=True)) / np.sqrt(new.var(axis=1, keepdims=True) + 1e-6)
         levels.append(new * norm["scale"] + norm["bias"])
     h = np.maximum(np.hstack(levels[1:]) @ params["hidden"]["kernel"] + params["hidden"]["bias"], 0)

@@ -42,11 +42,11 @@ def test_geometry_is_what_it_says():
         logs = [np.log(d + 0.01), np.log(abs(on_target) + 0.01)]
         rows.append([*np.clip([on_target, on_source], -2, 2), *squashed, min(d, 4), *logs, np.clip((p - q)[2], -2, 2), np.dot(n, m)])
         rows[-1] += [0.5 * np.log(np.dot(p, p) + 1) - 2.7, abs(m[2])]
-    rows = np.array(rows)
-    means = rows[mask][:, [6, 7, 9]].mean(axis=0)  # over the valid rows
-    np.testing.assert_allclose(columns, np.hstack([rows, np.tile(means, (NUM, 1))]), atol=1e-3)
+    table = np.array(rows)
+    means = table[mask][:, [6, 7, 9]].mean(axis=0)  # over the valid rows
+    np.testing.assert_allclose(columns, np.hstack([table, np.tile(means, (NUM, 1))]), atol=1e-3)
     np.testing.assert_allclose(along, np.sum((points - targets) * target_normals, axis=1), atol=1e-4)
-    np.testing.assert_allclose(agreement, rows[:, 9], atol=1e-5)
+    np.testing.assert_allclose(agreement, table[:, 9], atol=1e-5)
 
 
 @pytest.mark.parametrize("linear", ["yaw", "mirror"])
@@ -81,7 +81,7 @@ def sensible(source, target, geometry):
 
 def cloud(scan):
     embedding = jnp.zeros((len(scan.mask), 4))
-    return fine.Cloud(*(jnp.asarray(a) for a in scan[:2]), embedding, jnp.asarray(scan.mask))
+    return fine.Cloud(jnp.asarray(scan.points), jnp.asarray(scan.normals), embedding, jnp.asarray(scan.mask))
 
 
 @functools.cache

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from delo_jax import inference
-from delo_jax.model import delo, fine
+from delo_jax.model import delo
+from delo_jax.model.statistics import NUM_STATISTICS
 from delo_jax.ops import evidence
 from delo_jax.preprocess import preprocess
 from tests.fixtures import TINY, T_street, dirty, errors, street_points, street_poses, street_scan, thinned, tiny_model
@@ -82,7 +83,7 @@ def test_pose_turns_with_both_scans(yaw_deg):
 
     here, there = solve(encoded(0), encoded(1)), solve(turned(encoded(0)), turned(encoded(1)))
     np.testing.assert_allclose(there.T_target_source, G @ here.T_target_source @ np.linalg.inv(G), atol=5e-3)
-    np.testing.assert_allclose(there.statistics, here.statistics, atol=0.05)
+    np.testing.assert_allclose(there.statistics, here.statistics, atol=0.2)  # in standard deviations
     np.testing.assert_allclose(there.observability, here.observability, atol=5e-3)
     assert abs(np.dot(there.weakest_axis, R @ here.weakest_axis)) > 0.99
 
@@ -96,7 +97,7 @@ def test_one_pair_at_a_time_or_several():
     for k, pair in enumerate(pairs):
         one = solve(*pair)
         np.testing.assert_allclose(batch.T_target_source[k], one.T_target_source, atol=2e-3)
-        np.testing.assert_allclose(batch.statistics[k], one.statistics, atol=0.05)
+        np.testing.assert_allclose(batch.statistics[k], one.statistics, atol=0.2)  # in standard deviations
         assert batch.used_coarse[k] == one.used_coarse
 
 
@@ -106,54 +107,17 @@ def test_empty_scans_give_finite_numbers(empty):
     nothing = preprocess(street_points(0)[:0], TINY.preprocess)
     scans = [nothing if gone else street_scan(frame) for frame, gone in enumerate(empty)]
     T_init = T_street()
-    found = solve(*(inference.encode(tiny_model(), scan) for scan in scans), T_init)
+    source, target = (inference.encode(tiny_model(), scan) for scan in scans)
+    found = solve(source, target, T_init)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
     if empty[0]:
         np.testing.assert_array_equal(found.information, np.zeros((6, 6)))
-
-
-def matches_of_the_street():
-    model = tiny_model()
-    source, target = (inference.encode(model, thinned(street_scan(frame), 200, 40)).cloud for frame in (0, 1))
-    return jax.jit(lambda a, b, T: fine.match(model.confidence, a, b, T))(source, target, jnp.asarray(T_street(), jnp.float32))
-
-
-def test_statistics_are_what_they_say():
-    """Oracle: NumPy in float64, over the valid rows alone; compiled and not."""
-    matches = matches_of_the_street()
-    T_delta, information = fine.step(matches, cfg=TINY.fine)
-    T, apart = (jnp.asarray(P, jnp.float32) for P in (T_street(), pose(0.3, 0.0, 0.1, yaw_deg=2.0)))
-    arguments = matches, information, T, T_delta, apart, jnp.asarray(0.4), jnp.asarray(0.2)
-    found, compiled = delo.statistics(*arguments), jax.jit(delo.statistics)(*arguments)
-    np.testing.assert_allclose(compiled, found, atol=1e-4)
-    assert found.shape == (delo.NUM_STATISTICS,)
-
-    valid = np.asarray(matches.weights) > 0
-    assert valid.sum() == 200
-    rows = fine.Matches(*(np.asarray(field, np.float64)[valid] for field in matches))
-    w, d, agreement = rows.weights, np.abs(rows.plane_distance), rows.agreement
-    away = np.linalg.norm(rows.points - rows.targets, axis=1)
-    score = np.mean(np.maximum(agreement, 0) ** 2 / (1 + (d / 0.1) ** 2) / (1 + away**2))
-    lever = np.diag([1 / 15.0] * 3 + [1.0] * 3)
-    eigenvalues = np.linalg.eigvalsh(lever @ np.asarray(information, np.float64) @ lever) / w.sum()
-    lengths = []
-    for P in (T_delta, apart, T):
-        P = np.asarray(P, np.float64)
-        angle = np.arctan2(np.linalg.norm([P[2, 1] - P[1, 2], P[0, 2] - P[2, 0], P[1, 0] - P[0, 1]]), np.trace(P[:3, :3]) - 1)
-        lengths += [np.linalg.norm(P[:3, 3]), 15.0 * angle]
-    expected = [
-        *(3 * w.sum() / len(valid), 3 * score, 0.6, 3 * score - 0.6),
-        *(np.log10(np.append(np.quantile(d, [0.25, 0.5, 0.75, 0.9]), np.sqrt(np.average(d**2, weights=w))) + 1e-3) + 1),
-        *(np.log10(np.maximum(eigenvalues, 1e-6)) + 1),
-        *(np.log10(np.array(lengths) + 1e-4) + 1),
-        *(0.8, agreement.mean(), 0.2),
-    ]
-    np.testing.assert_allclose(found, expected, atol=2e-3)
+        np.testing.assert_allclose(found.T_target_source, T_init, atol=1e-6)
 
 
 def test_evidence_is_in_the_units_of_the_config():
     """Oracle: the same raw numbers, constrained, times 1 mrad and 1 cm; their squares for the variance."""
-    statistics = jnp.linspace(-1, 1, delo.NUM_STATISTICS)
+    statistics = jnp.linspace(-1, 1, NUM_STATISTICS)
     raw, expected_logit = tiny_model().apply("evidence", statistics)
     raw = evidence.constrain(raw)
     nig, logit = delo.predict_evidence(tiny_model(), statistics)

@@ -40,10 +40,10 @@ def test_wall_scanned_while_moving_becomes_flat(speed):
     """
     twist = np.array([0.0, 0.0, 0.3, speed, 0.0, 0.0])
     rng = np.random.default_rng(0)
-    wall = np.stack([np.full(400, 20.0), rng.uniform(-10, 10, 400), rng.uniform(-1, 4, 400)], axis=1)
-    times = rng.uniform(-0.05, 0.05, 400)
+    wall = np.stack([np.full(120, 20.0), rng.uniform(-10, 10, 120), rng.uniform(-1, 4, 120)], axis=1)
+    times = rng.uniform(-0.05, 0.05, 120)
     Ts_lidar_world = expm(np.array([hat(-t * twist) for t in times]))
-    measured = np.einsum("nij,nj->ni", Ts_lidar_world[:, :3], np.hstack([wall, np.ones((400, 1))]))
+    measured = np.einsum("nij,nj->ni", Ts_lidar_world[:, :3], np.hstack([wall, np.ones((120, 1))]))
     turned = 0.3 * 0.1 / 127 / 2 * 23.0  # the rotation's half step at the farthest point
     found = moving(twist).deskew(measured.astype(np.float32), times)
     assert np.abs(measured[:, 0] - 20.0).max() > 0.04 * speed
@@ -56,7 +56,8 @@ def test_point_without_a_time_stays_where_it_is():
     points = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
     times = np.array([-0.05, np.nan, 0.0, np.inf, 0.05])
     found = moving().deskew(points, times)
-    expected = [(expm(hat(t * TWIST)) @ np.append(p, 1.0))[:3] for t, p in zip(np.where(np.isfinite(times), times, 0.0), points, strict=True)]
+    known = np.where(np.isfinite(times), times, 0.0)
+    expected = [(expm(hat(t * TWIST)) @ np.append(p, 1.0))[:3] for t, p in zip(known, points, strict=True)]
     np.testing.assert_allclose(found, expected, atol=6e-3)  # half a step of 12 m/s, and of the rotation
 
 

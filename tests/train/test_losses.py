@@ -113,7 +113,8 @@ def test_evidence_loss_is_a_student_t_and_its_regulariser(seed):
     scale = np.sqrt(scaled.beta * (1 + scaled.nu) / (scaled.nu * scaled.alpha))
     likelihood = -scipy.stats.t(df=2 * scaled.alpha, loc=scaled.gamma, scale=scale).logpdf(error)
     penalty = np.abs(np.clip(error, -10, 10) - scaled.gamma) * (2 * scaled.nu + scaled.alpha)
-    found = evidence_loss(NIG(*as_float32(nig)), *as_float32((error * units, units)), 0.03)
+    observed, units = as_float32((error * units, units))
+    found = evidence_loss(NIG(*as_float32(nig)), observed, units, 0.03)
     np.testing.assert_allclose(found, np.mean(likelihood + 0.03 * penalty), rtol=1e-4)
 
 
@@ -124,5 +125,5 @@ def test_success_loss_is_a_cross_entropy(length_m, angle_deg, logit):
     observed = np.r_[np.radians(angle_deg) * np.array([0.6, 0.0, 0.8]), length_m * np.array([0.0, 0.8, -0.6])]
     lost = length_m > 0.5 or angle_deg > 2.0
     expected = -(scipy.stats.logistic.logsf(logit) if lost else scipy.stats.logistic.logcdf(logit))
-    found = success_loss(*as_float32((np.array(logit), observed)), LIMITS)
+    found = success_loss(jnp.asarray(logit), jnp.asarray(observed, jnp.float32), LIMITS)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-12)

@@ -80,9 +80,8 @@ def test_key_points_follow_their_rows():
     originals = world("street").scans
     for seed in range(6):
         pair = random_pair(world("street"), np.random.default_rng(seed))
-        frame = next(
-            k for k in range(len(originals.mask)) if {*map(bytes, pair.source.features[pair.source.mask])} <= {*map(bytes, originals.features[k])}
-        )
+        rows = {*map(bytes, pair.source.features[pair.source.mask])}
+        frame = next(k for k in range(len(originals.mask)) if rows <= {*map(bytes, originals.features[k])})
         before = originals.features[frame][originals.keypoint_index[frame][originals.keypoint_mask[frame]]]
         after = pair.source.features[pair.source.keypoint_index[pair.source.keypoint_mask]]
         assert {*map(bytes, after)} <= {*map(bytes, before)}
@@ -133,10 +132,10 @@ def test_same_generator_same_batch(evidence):
 def test_unrelated_pair_is_lost_whatever_the_answer():
     """Oracle: the drawn truth; metres or tens of degrees from the start, and no reason to prefer it."""
     first, second = world("street"), world("simulated")
-    far = 0
+    lengths = []
     for seed in range(10):
         pair = unrelated_pair(first, second, np.random.default_rng(seed))
         assert_rigid(pair.T_target_source)
         error = np.linalg.inv(pair.T_init.astype(np.float64)) @ pair.T_target_source
-        far += np.linalg.norm(error[:3, 3]) > 0.5
-    assert far >= 9
+        lengths.append(np.linalg.norm(error[:3, 3]))
+    assert np.median(lengths) > 3.0

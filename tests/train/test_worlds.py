@@ -71,7 +71,8 @@ def test_interrupted_run_goes_on(simulator, tmp_path):
     simulator.clear()
     again = list(worlds(CFG, tmp_path, validation=False))
     assert len(simulator) == 2
-    assert all(a.tobytes() == b.tobytes() for one, other in zip(whole, again, strict=True) for a, b in zip(one.scans, other.scans, strict=True))
+    for one, other in zip(whole, again, strict=True):
+        assert all(a.tobytes() == b.tobytes() for a, b in zip(one.scans, other.scans, strict=True))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 import scipy.stats
 
 from delo_jax.config import StatusConfig
-from delo_jax.uncertainty.covariance import Uncertainty, from_evidence, unknown, widen
+from delo_jax.uncertainty.covariance import from_evidence, unknown, widen_along
 
 CFG = StatusConfig(unknown_rotation_deg=10.0, unknown_translation_m=2.0)
 
@@ -32,12 +32,13 @@ def test_unknown_is_what_the_config_says():
     np.testing.assert_array_equal(found.aleatoric, np.zeros(6))
 
 
-def test_widening_raises_what_is_too_small_and_nothing_else():
-    """Oracle: by hand, axis by axis; the noise of the data stays, the doubt fills up."""
-    aleatoric = np.array([1e-6, 1e-6, 1.0, 1.0, 3.0, 5.0])
-    epistemic = np.array([1e-6, 1.0, 1e-6, 1.0, 3.0, 0.5])
-    found = widen(Uncertainty(aleatoric, epistemic, np.diag(aleatoric + epistemic)), CFG)
-    small = np.radians(10.0) ** 2
-    np.testing.assert_allclose(np.diag(found.covariance), [small, 1.0 + 1e-6, 1.0 + 1e-6, 4.0, 6.0, 5.5])
-    np.testing.assert_array_equal(found.aleatoric, aleatoric)
-    np.testing.assert_allclose(found.epistemic, np.diag(found.covariance) - aleatoric)
+def test_widening_adds_doubt_along_one_direction():
+    """Oracle: quadratic forms; along the direction 4 m^2 more, across it and in rotation nothing."""
+    rng = np.random.default_rng(0)
+    known = from_evidence(np.ones(6), np.full(6, 2.0), rng.uniform(1e-6, 1e-3, 6))
+    direction, across, _ = np.linalg.qr(rng.normal(size=(3, 3)))[0].T
+    found = widen_along(known, direction, CFG)
+    added = (found.covariance - known.covariance)[3:, 3:]
+    np.testing.assert_allclose([direction @ added @ direction, across @ added @ across], [4.0, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(found.covariance[:3], known.covariance[:3])
+    np.testing.assert_allclose(found.aleatoric + found.epistemic, np.diag(found.covariance))
