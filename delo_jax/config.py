@@ -12,11 +12,19 @@ from delo_jax.errors import ConfigError
 
 T = TypeVar("T")
 
+NUM_FEATURES = 8  # numbers per point that `preprocess` computes and the network reads
+
 
 def require(condition: bool, name: str, expected: str, got: object) -> None:
     """Raise a ConfigError `name: expected ..., got ...` unless the condition holds."""
     if not condition:
         raise ConfigError(f"{name}: expected {expected}, got {got!r}")
+
+
+def require_positive(config: object, where: str, *names: str) -> None:
+    """Raise a ConfigError unless all of these fields are above zero."""
+    for name in names:
+        require(getattr(config, name) > 0, f"{where}{name}", "a value above 0", getattr(config, name))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,6 +54,7 @@ class PreprocessConfig:
 
     def __post_init__(self):
         require(0.0 <= self.min_range_m < self.max_range_m, "preprocess.min_range_m", "0 <= min_range_m < max_range_m", self.min_range_m)
+        require_positive(self, "preprocess.", "keypoint_voxel_m", "keypoint_range_m")
         require(0.0 < self.voxel_m <= self.point_voxel_m, "preprocess.voxel_m", "0 < voxel_m <= point_voxel_m", self.voxel_m)
         require(self.num_neighbors >= 5, "preprocess.num_neighbors", "at least 5", self.num_neighbors)
         require(0.0 < self.ground_share <= 1.0, "preprocess.ground_share", "a value in (0, 1]", self.ground_share)
@@ -74,6 +83,7 @@ class CoarseConfig:
     """Reweighted rounds of the planar pose."""
 
     def __post_init__(self):
+        require_positive(self, "coarse.", "num_neighbors", "edge_scale_m", "width", "embedding_dim", "consistency_m")
         require(0.0 < self.mass <= 1.0, "coarse.mass", "a value in (0, 1]", self.mass)
         require(self.num_iters >= 1, "coarse.num_iters", "at least 1", self.num_iters)
 
@@ -111,6 +121,9 @@ class EvidenceConfig:
     translation_scale_m: float = 1e-2
     """Unit of the head's translation outputs."""
 
+    def __post_init__(self):
+        require_positive(self, "evidence.", "width", "rotation_scale_rad", "translation_scale_m")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StatusConfig:
@@ -127,7 +140,7 @@ class StatusConfig:
     min_points: int = 100
     """A scan with fewer usable points is `rejected`."""
     min_observability: float = 3e-3
-    """Smallest share of the weighted normals that must point along every direction, else `degenerate`."""
+    """Mean squared plane distance that a metre of motion must cause in every direction [m^2/m^2], else `degenerate`."""
     unknown_rotation_deg: float = 30.0
     """Standard deviation of a pose nobody measured."""
     unknown_translation_m: float = 5.0
@@ -201,11 +214,13 @@ class TrainConfig:
 
     def __post_init__(self):
         require(self.num_frames >= 2, "num_frames", "at least 2", self.num_frames)
-        require(self.num_scenes >= 1, "num_scenes", "at least 1", self.num_scenes)
-        require(self.num_validation_scenes >= 1, "num_validation_scenes", "at least 1", self.num_validation_scenes)
-        require(self.batch_size >= 1, "batch_size", "at least 1", self.batch_size)
+        require_positive(self, "", "num_scenes", "num_validation_scenes", "batch_size", "num_points", "learning_rate", "validate_every")
+        require(self.seed >= 0, "seed", "at least 0", self.seed)
+        for name in ("num_steps", "num_evidence_steps"):
+            require(getattr(self, name) == 0 or getattr(self, name) >= 10, name, "0 or at least 10", getattr(self, name))
+        for name in ("coarse_weight", "fine_weight", "evidence_weight", "regulariser_weight"):
+            require(getattr(self, name) >= 0, name, "at least 0", getattr(self, name))
         require(1 <= self.num_iters <= 4, "num_iters", "1 to 4, as many as the loss has weights", self.num_iters)
-        require(self.validate_every >= 1, "validate_every", "at least 1", self.validate_every)
 
 
 def from_dict(cls: type[T], table: Mapping[str, Any], where: str = "config") -> T:

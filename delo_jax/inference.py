@@ -11,14 +11,15 @@ from numpy.typing import ArrayLike
 from delo_jax.errors import ScanError
 from delo_jax.geometry import se3
 from delo_jax.model import delo
-from delo_jax.preprocess import preprocess
+from delo_jax.preprocess import check_points, preprocess
 from delo_jax.uncertainty import covariance, status
+from delo_jax.uncertainty.observability import observability
 
 encode = jax.jit(delo.encode)
 solve = jax.jit(delo.solve)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate:
     """Pose of a pair with its uncertainty and health.
 
@@ -29,7 +30,7 @@ class Estimate:
     T_target_source: np.ndarray
     """(4, 4) float64: maps source points into the target frame."""
     covariance: np.ndarray
-    """(6, 6)."""
+    """(6, 6); also holds the square of the head's expected error, which is not applied to the pose."""
     aleatoric: np.ndarray
     """(6,) variances: noise of the data."""
     epistemic: np.ndarray
@@ -41,16 +42,29 @@ class Estimate:
     reason: str
     """Why the status is not ok; empty when it is."""
 
+    @classmethod
+    def exact(cls, T_target_source: np.ndarray) -> "Estimate":
+        """A pose that is known without error."""
+        none = np.zeros(6)
+        return cls(
+            T_target_source=T_target_source,
+            covariance=np.zeros((6, 6)),
+            aleatoric=none,
+            epistemic=none,
+            status="ok",
+            confidence=1.0,
+            reason="",
+        )
+
     def inverted(self) -> "Estimate":
         """The same estimate of the inverse pose, `T_source_target`, covariance carried through the adjoint."""
-        covariance_inverse = se3.invert_covariance(self.covariance, self.T_target_source)
-        aleatoric = se3.adjoint(self.T_target_source) ** 2 @ self.aleatoric  # of independent axes
+        squares = se3.adjoint(self.T_target_source) ** 2  # the head gives variances axis by axis
         return dataclasses.replace(
             self,
             T_target_source=se3.inverse(self.T_target_source),
-            covariance=covariance_inverse,
-            aleatoric=aleatoric,
-            epistemic=np.diag(covariance_inverse) - aleatoric,
+            covariance=se3.invert_covariance(self.covariance, self.T_target_source),
+            aleatoric=squares @ self.aleatoric,
+            epistemic=squares @ self.epistemic,
         )
 
 
@@ -67,11 +81,7 @@ def prepare(params: delo.Model, points: ArrayLike) -> EncodedScan:
     Raises:
         ScanError: not an array of numbers of shape (n, 3).
     """
-    try:
-        array = np.asarray(points)
-    except ValueError as error:
-        raise ScanError(f"points: expected an array of shape (n, 3) in metres, got rows of different lengths: {error}") from error
-    scan = preprocess(array, params.cfg.preprocess)
+    scan = preprocess(check_points(points), params.cfg.preprocess)
     return EncodedScan(encode(params, scan), int(scan.mask.sum()))
 
 
@@ -80,21 +90,21 @@ def align(params: delo.Model, source: EncodedScan, target: EncodedScan, T_target
     limits = params.cfg.status
     start = np.asarray(T_target_source_init, np.float64)
     result = jax.device_get(solve(params, source.encoding, target.encoding, jnp.asarray(start, jnp.float32)))
+    seen = observability(result.information) if result.finite else observability(np.zeros((6, 6)))
     health = status.judge(
         num_points=(source.num_points, target.num_points),
         finite=bool(result.finite),
         confidence=float(np.nan_to_num(result.confidence)),
-        observability=result.observability,
-        weakest_axis=result.weakest_axis,
+        seen=seen,
         cfg=limits,
     )
     if health.status == "rejected":
         T, known = start, covariance.unknown(limits)
     else:
         nig = [np.asarray(value, np.float64) for value in result.nig]
-        T, known = se3.exp(se3.log(np.asarray(result.T_target_source, np.float64))), covariance.from_evidence(*nig[1:])
+        T, known = se3.exp(se3.log(np.asarray(result.T_target_source, np.float64))), covariance.from_evidence(*nig)
     if health.status == "degenerate":
-        known = covariance.widen_along(known, T[:3, :3].T @ result.weakest_axis, limits)
+        known = covariance.widen(known, seen, limits)
     return Estimate(
         T_target_source=T,
         covariance=known.covariance,

@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from delo_jax.config import PreprocessConfig
+from delo_jax.config import NUM_FEATURES, PreprocessConfig
 from delo_jax.errors import ScanError
 from delo_jax.geometry.normals import plane_fit
 
-NUM_FEATURES = 8
 MIN_NEIGHBORS = 5  # a plane through fewer points says nothing
 HORIZONTAL = 0.85  # |n_z| above which a surface counts as ground-like
 
@@ -26,20 +26,23 @@ class Scan(NamedTuple):
     keypoint_mask: Bool[Array, " k"] | Bool[np.ndarray, " k"]
 
 
-def check_points(points: np.ndarray, name: str = "points") -> np.ndarray:
+def check_points(points: ArrayLike, name: str = "points") -> np.ndarray:
     """`points` as a float32 array of shape (n, 3).
 
     Raises:
         ScanError: not an array of numbers, or not of shape (n, 3).
     """
-    points = np.asarray(points)
-    if points.ndim != 2 or points.shape[1] != 3:
-        hint = "; pass points[:, :3]" if points.ndim == 2 and points.shape[1] > 3 else ""
-        raise ScanError(f"{name}: expected an array of shape (n, 3) in metres, got shape {points.shape}{hint}")
-    if points.dtype.kind not in "fiu":
-        raise ScanError(f"{name}: expected numbers, got dtype {points.dtype}; convert to float32")
+    try:
+        array = np.asarray(points)
+    except ValueError as error:
+        raise ScanError(f"{name}: expected an array of shape (n, 3) in metres, got rows of different lengths: {error}") from error
+    if array.ndim != 2 or array.shape[1] != 3:
+        hint = "; pass points[:, :3]" if array.ndim == 2 and array.shape[1] > 3 else ""
+        raise ScanError(f"{name}: expected an array of shape (n, 3) in metres, got shape {array.shape}{hint}")
+    if array.dtype.kind not in "fiu":
+        raise ScanError(f"{name}: expected numbers, got dtype {array.dtype}; convert to float32")
     with np.errstate(over="ignore"):  # beyond float32 is infinite, and dropped as such
-        return points.astype(np.float32, copy=False)
+        return array.astype(np.float32, copy=False)
 
 
 def preprocess(points: np.ndarray, cfg: PreprocessConfig) -> Scan:

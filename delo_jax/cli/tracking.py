@@ -23,7 +23,7 @@ from delo_jax.config import DeloConfig, to_toml
 from delo_jax.data.fields import RawScan
 from delo_jax.errors import ConfigError, ScanError
 from delo_jax.model.delo import Model
-from delo_jax.pipeline.lidar_odometry import LidarOdometry
+from delo_jax.pipeline.lidar_odometry import Frame, LidarOdometry
 from delo_jax.pipeline.trajectory import RunWriter, Trajectory
 from delo_jax.report.figures import trajectory_figure
 
@@ -154,7 +154,7 @@ def _loop(job: Job, odometry: LidarOdometry, writer: RunWriter) -> tuple[list[fl
             begin = time.perf_counter()
             scan = _acquire(job.source, index)
             acquired.append(time.perf_counter() - begin)
-            frame = odometry.reject(scan, stamp_ns) if isinstance(scan, str) else odometry.register(scan.points, stamp_ns, scan.times)
+            frame = _register(odometry, scan, stamp_ns)
             writer.append(frame._replace(timing={job.stage: acquired[-1], **frame.timing}))
             bar.advance(task)
     return acquired, False
@@ -166,6 +166,16 @@ def _acquire(source: Scans, index: int) -> RawScan | str:
         return source[index]
     except ScanError as error:
         return str(error)
+
+
+def _register(odometry: LidarOdometry, scan: RawScan | str, stamp_ns: int | None) -> Frame:
+    """The frame of a scan; a scan that cannot be used is a rejected frame, not the end of the drive."""
+    if isinstance(scan, str):
+        return odometry.reject(scan, stamp_ns)
+    try:
+        return odometry.register(scan.points, stamp_ns, scan.times)
+    except ScanError as error:
+        return odometry.reject(str(error), stamp_ns)
 
 
 def _result(job: Job, trajectory: Trajectory, acquired: list[float], compile_s: float, interrupted: bool) -> Result:

@@ -51,7 +51,7 @@ class Train(Command):
         from delo_jax.train.loop import train
 
         out = self.out or Path("runs") / f"train-{Path(self.what).stem}"
-        command = shlex.join(["delo", "train", self.what, "--out", str(out)])
+        command = shlex.join(["delo", "train", self.what, *([] if self.out is None else ["--out", str(out)])])
         try:
             with progress("steps") as bar:
                 model, errors = train(cfg, out, BarReporter(bar))
@@ -100,14 +100,14 @@ def print_errors(title: str, errors: "list[GapErrors]") -> None:
 def card(cfg: config.TrainConfig, command: str, errors: "list[GapErrors]") -> dict[str, Any]:
     """What a user of the weights should know; `weights.save` adds config, format and SHA-256."""
     from delo_jax.sim import KINDS
-    from delo_jax.train.worlds import VALIDATION_SEED
+    from delo_jax.train.worlds import SEEDS_PER_RUN, VALIDATION_SEED
 
     scenes = f"{cfg.num_scenes} simulated scenes of {cfg.num_frames} scans, kinds {', '.join(KINDS)}; no recorded data"
     names = "jax", "flax", "optax", "numpy"
     return {
         "name": f"delo-{cfg.model.name}",
         "data": scenes,
-        "seeds": {"base": cfg.seed, "validation": f"worlds from seed {VALIDATION_SEED} on, never trained on"},
+        "seeds": {"base": cfg.seed, "validation": f"worlds from seed {cfg.seed * SEEDS_PER_RUN + VALIDATION_SEED} on, never trained on"},
         "commands": [command],
         "training": config_table(cfg),
         "steps": {"matching and pose": cfg.num_steps, "evidence": cfg.num_evidence_steps},

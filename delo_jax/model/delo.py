@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from delo_jax.config import DeloConfig
+from delo_jax.config import NUM_FEATURES, DeloConfig
 from delo_jax.geometry import se3
+from delo_jax.geometry.point_to_plane import point_to_plane_step
 from delo_jax.model import fine
 from delo_jax.model.coarse import CoarsePose, coarse_pose
 from delo_jax.model.dgcnn import EdgeEncoder
@@ -21,7 +22,6 @@ from delo_jax.ops.knn import knn
 from delo_jax.ops.transport import matching_cost
 
 full_float32 = jax.default_matmul_precision("highest")
-NUM_FEATURES = 8
 
 
 class Network(nn.Module):
@@ -96,12 +96,10 @@ class Registration(NamedTuple):
     """Answer of one pair; arrays only."""
 
     T_target_source: Float[Array, "4 4"]
-    information: Float[Array, "6 6"]  # of a left twist in the target frame, per unit of squared metre
+    information: Float[Array, "6 6"]  # of the planes, for a right perturbation of the pose, per unit of weight
     nig: evidence.NIG  # of log(T_pred^-1 T_true), order [omega, v], rad and m
     confidence: Float[Array, ""]  # probability that the pair is not lost
     statistics: Float[Array, " s"]
-    observability: Float[Array, "3"]  # ascending eigenvalues of the mean weighted n n^T; 1/3 each when even
-    weakest_axis: Float[Array, "3"]  # unit direction in the target frame that is seen worst
     used_coarse: Bool[Array, ""]  # the pose came from the coarse stage, not from T_init
     finite: Bool[Array, ""]
 
@@ -171,9 +169,9 @@ def solve(model: Model, source: Encoding, target: Encoding, T_init: Float[Array,
     disagreement = se3.inverse(refined[1 - best]) @ refined[best]
     stats = statistics(matches, information, T, T_delta, disagreement, first.inlier_share, scores[1 - best])
     nig, success_logit = predict_evidence(model, stats)
-    values, vectors = jnp.linalg.eigh(_direction_spread(matches))
-    finite = jnp.all(jnp.isfinite(T)) & jnp.all(jnp.isfinite(stats)) & jnp.all(jnp.isfinite(values))
-    return Registration(T, information, nig, nn.sigmoid(success_logit), stats, values, vectors[:, 0], best == 1, finite)
+    planes = _plane_information(matches, T)
+    finite = jnp.all(jnp.isfinite(T)) & jnp.all(jnp.isfinite(stats)) & jnp.all(jnp.isfinite(planes))
+    return Registration(T, planes, nig, nn.sigmoid(success_logit), stats, best == 1, finite)
 
 
 def predict_evidence(model: Model, stats: Float[Array, " s"]) -> tuple[evidence.NIG, Float[Array, ""]]:
@@ -192,6 +190,8 @@ def _first(cloud: fine.Cloud, num: int) -> fine.Cloud:
     return jax.tree.map(lambda array: array[:num], cloud)
 
 
-def _direction_spread(matches: fine.Matches) -> Float[Array, "3 3"]:
-    w = (matches.weights / (jnp.sum(matches.weights) + 1e-6))[:, None]
-    return (w * matches.normals).T @ matches.normals
+def _plane_information(matches: fine.Matches, T: Float[Array, "4 4"]) -> Float[Array, "6 6"]:
+    """Gauss-Newton matrix of the plane distances alone, carried from the left twist to the right perturbation of T."""
+    step = point_to_plane_step(*matches[:3], matches.weights, jnp.zeros_like(matches.weights), damping=0.0)
+    Ad = se3.adjoint(T)
+    return Ad.T @ step.information @ Ad / (jnp.sum(matches.weights) + 1e-6)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from delo_jax import inference
+from delo_jax.data.fields import FRAME_PERIOD_NS, MAX_SWEEP_S
 from delo_jax.errors import ScanError
 from delo_jax.geometry import se3
 from delo_jax.inference import EncodedScan, Estimate
@@ -17,19 +18,18 @@ from delo_jax.pipeline.trajectory import Trajectory
 from delo_jax.preprocess import check_points
 from delo_jax.uncertainty import covariance
 
-MAX_SWEEP_S = 1.0  # a point measured farther from the stamp has a time of another kind
-DEFAULT_PERIOD_NS = 100_000_000  # when no stamps are given: 10 scans a second
-
 
 class Frame(NamedTuple):
     """One registered scan."""
 
     T_world_lidar: np.ndarray
-    """(4, 4) float64; the world is the sensor frame of the first scan."""
+    """(4, 4) float64; the world is the sensor frame of the first usable scan."""
     covariance: np.ndarray
     """(6, 6) of T_world_lidar, right perturbation, order [omega, v]; grows along the drive."""
     motion: Estimate
-    """Of the sensor's motion since the last scan that was not rejected: its pose is T_previous_current."""
+    """Of the sensor's motion since frame `since`: its pose is T_since_current."""
+    since: int
+    """Number of the frame that the motion starts from: the one before, or the last good one before bad scans."""
     status: str
     """That of the motion."""
     stamp_ns: int
@@ -37,20 +37,36 @@ class Frame(NamedTuple):
     """Seconds per stage."""
 
 
+class Sweep(NamedTuple):
+    """A scan as measured."""
+
+    points: np.ndarray  # (n, 3), each in the sensor frame at its own time [m]
+    times_s: np.ndarray  # (n,) relative to the stamp
+
+
 class Source(NamedTuple):
-    """The last good scan and where it was."""
+    """A scan that later ones may be aligned with."""
 
     scan: EncodedScan
-    points: np.ndarray  # as measured, kept until a first motion is known
-    times_s: np.ndarray | None
+    skewed: Sweep | None  # what `scan` was made of, as long as no motion is known that could de-skew it
     stamp_ns: int
+    number: int  # of its frame
+
+
+class Anchor(NamedTuple):
+    """A source and where it was."""
+
+    source: Source
+    T_world_lidar: np.ndarray
+    covariance: np.ndarray
 
 
 class LidarOdometry:
     """Scan-to-scan LiDAR odometry. Not thread-safe; one instance per sensor stream.
 
-    A bad scan never stops a drive: its pose is the motion model's, its status `rejected`, its covariance honest about it,
-    and the last good scan stays the source, so that the next pair bridges the gap.
+    A bad scan never stops a drive: its pose is the motion model's, its status `rejected`, its covariance honest about it.
+    The last good scan stays the source, so that the next pair bridges the gap; when it has gone out of reach, two
+    consecutive scans that fit each other take over, at the predicted pose and with its wide covariance.
 
     Args:
         params: weights, from `delo_jax.load`.
@@ -69,13 +85,13 @@ class LidarOdometry:
     ):
         self._params, self._deskew, self._prepare, self._align = params, deskew, prepare, align
         self._motion_model = ConstantVelocity()
-        self._source: Source | None = None
-        self._T_world_source, self._covariance = np.eye(4), np.zeros((6, 6))
+        self._anchor: Anchor | None = None  # the last good scan
+        self._doubtful: Anchor | None = None  # the newest usable scan that did not fit it
         self._num_frames, self._last_stamp_ns, self._num_rejected = 0, 0, 0
         self._trajectory = Trajectory()
 
     def register(self, points: np.ndarray, stamp_ns: int | None = None, times_s: np.ndarray | None = None) -> Frame:
-        """Pose of the sensor at this scan; the first scan defines the world frame.
+        """Pose of the sensor at this scan; the first usable scan defines the world frame.
 
         Args:
             points: (n, 3) in the sensor frame [m].
@@ -83,21 +99,20 @@ class LidarOdometry:
             times_s: (n,) time of each point relative to the stamp, for the de-skew; None when already compensated.
 
         Raises:
-            ScanError: wrong shape or dtype, or a stamp that does not rise; the state is as if the scan never arrived.
+            ScanError: wrong shape or dtype, times of another kind, or a stamp that does not rise; the state is as if the
+                scan never arrived.
         """
-        points = check_points(points)
-        stamp_ns = self._check_stamp(stamp_ns)
-        if times_s is not None and np.shape(times_s) != (len(points),):
-            raise ScanError(f"times_s: expected one time per point, shape ({len(points)},), got {np.shape(times_s)}")
-        if times_s is not None and np.any(np.abs(times_s) > MAX_SWEEP_S):
-            raise ScanError(
-                f"times_s: expected seconds relative to the stamp, within {MAX_SWEEP_S:g} s, got {np.nanmax(np.abs(times_s)):g} s"
-            )
+        points, stamp_ns = check_points(points), self._check_stamp(stamp_ns)
+        times_s = self._check_times(times_s, len(points))
         begin = time.perf_counter()
-        times_s = times_s if self._deskew else None
-        target = Source(self._prepare_at(points, times_s), points, times_s, stamp_ns)
+        sweep = None if times_s is None else Sweep(points, times_s)
+        scan = self._prepare(self._params, points) if sweep is None else self._prepare_still(sweep, self._motion_model)
+        skewed = None
+        if sweep is not None and self._motion_model.velocity is None:
+            skewed = Sweep(points.copy(), sweep.times_s.copy())
+        target = Source(scan, skewed, stamp_ns, self._num_frames)
         prepared = time.perf_counter()
-        motion, target = (self._first(target), target) if self._source is None else self._align_to(self._source, target)
+        motion, target = self._locate(target)
         timing = {"prepare": prepared - begin, "solve": time.perf_counter() - prepared}
         return self._finish(target, motion, stamp_ns, timing)
 
@@ -112,65 +127,84 @@ class LidarOdometry:
 
     def _check_stamp(self, stamp_ns: int | None) -> int:
         if stamp_ns is None:
-            return self._last_stamp_ns + DEFAULT_PERIOD_NS if self._num_frames else 0
+            return self._last_stamp_ns + FRAME_PERIOD_NS if self._num_frames else 0
         if self._num_frames and stamp_ns <= self._last_stamp_ns:
             raise ScanError(f"stamp_ns: expected more than the last stamp {self._last_stamp_ns}, got {stamp_ns}; sort the scans by time")
         return int(stamp_ns)
 
-    def _prepare_at(self, points: np.ndarray, times_s: np.ndarray | None) -> EncodedScan:
-        still = points if times_s is None else self._motion_model.deskew(points, times_s)
-        return self._prepare(self._params, still)
+    def _check_times(self, times_s: np.ndarray | None, num_points: int) -> np.ndarray | None:
+        if times_s is None or not self._deskew:
+            return None
+        if np.shape(times_s) != (num_points,):
+            raise ScanError(f"times_s: expected one time per point, shape ({num_points},), got {np.shape(times_s)}")
+        farthest_s = np.max(np.abs(times_s), initial=0.0, where=np.isfinite(times_s))
+        if farthest_s > MAX_SWEEP_S:
+            raise ScanError(f"times_s: expected seconds relative to the stamp, within {MAX_SWEEP_S:g} s, got {farthest_s:g} s")
+        return np.asarray(times_s)
+
+    def _prepare_still(self, sweep: Sweep, motion: ConstantVelocity) -> EncodedScan:
+        return self._prepare(self._params, motion.deskew(*sweep))
+
+    def _locate(self, target: Source) -> tuple[Estimate, Source]:
+        """Motion to a new scan from the last good one, or from a doubtful one that it fits better; the scan as it was aligned."""
+        if self._anchor is None:
+            return self._first(target), target
+        motion, aligned = self._align_to(self._anchor.source, target)
+        if motion.status == "rejected" and self._doubtful is not None:
+            second, aligned_second = self._align_to(self._doubtful.source, target)
+            if second.status != "rejected":
+                self._anchor = self._doubtful
+                return second, aligned_second
+        return motion, aligned
 
     def _first(self, target: Source) -> Estimate:
         """The first scan is the world, unless it is unusable."""
         minimum = self._params.cfg.status.min_points
         if target.scan.num_points < minimum:
             return self._unmeasured(target.stamp_ns, f"the first scan has {target.scan.num_points} usable points, fewer than {minimum}")
-        zero = np.zeros(6)
-        return Estimate(
-            T_target_source=np.eye(4), covariance=np.zeros((6, 6)), aleatoric=zero, epistemic=zero, status="ok", confidence=1.0, reason=""
-        )
+        return Estimate.exact(np.eye(4))
 
     def _align_to(self, source: Source, target: Source) -> tuple[Estimate, Source]:
         """Motion T_source_target of a pair, started from the motion model's prediction, and the target as it was aligned."""
         elapsed_s = (target.stamp_ns - source.stamp_ns) * NANOSECOND
         guess = se3.inverse(self._motion_model.predict(elapsed_s))
         estimate = self._align(self._params, source.scan, target.scan, guess)
-        if self._motion_model.velocity is None and target.times_s is not None and estimate.status != "rejected":
+        if source.skewed and target.skewed and estimate.status != "rejected":
             # the first motion de-skews its own two scans, then is measured again
-            self._motion_model.update(se3.inverse(estimate.T_target_source), elapsed_s)
-            source, target = (scan._replace(scan=self._prepare_at(scan.points, scan.times_s)) for scan in (source, target))
-            estimate = self._align(self._params, source.scan, target.scan, estimate.T_target_source)
-            self._source = source
+            motion = ConstantVelocity()
+            motion.update(se3.inverse(estimate.T_target_source), elapsed_s)
+            scans = [self._prepare_still(sweep, motion) for sweep in (source.skewed, target.skewed)]
+            again = self._align(self._params, scans[0], scans[1], estimate.T_target_source)
+            if again.status != "rejected":
+                estimate, target = again, target._replace(scan=scans[1])
         return estimate.inverted(), target
 
     def _unmeasured(self, stamp_ns: int, reason: str) -> Estimate:
-        since = self._source.stamp_ns if self._source else stamp_ns
+        """What the motion model says of a motion that was not measured."""
+        since_ns = stamp_ns if self._anchor is None else self._anchor.source.stamp_ns
         known = covariance.unknown(self._params.cfg.status)
-        return Estimate(
-            T_target_source=self._motion_model.predict((stamp_ns - since) * NANOSECOND),
-            covariance=known.covariance,
-            aleatoric=known.aleatoric,
-            epistemic=known.epistemic,
-            status="rejected",
-            confidence=0.0,
-            reason=reason,
-        )
+        motion = Estimate.exact(self._motion_model.predict((stamp_ns - since_ns) * NANOSECOND))
+        return dataclasses.replace(motion, **known._asdict(), status="rejected", confidence=0.0, reason=reason)
 
     def _finish(self, target: Source | None, motion: Estimate, stamp_ns: int, timing: dict[str, float]) -> Frame:
         """Advance the state unless the motion was rejected, and record the frame."""
-        if motion.status == "rejected":  # nobody has measured for that many frames: standard deviations grow with them
+        anchor, number = self._anchor, self._num_frames
+        rejected = motion.status == "rejected"
+        if rejected:  # nobody has measured for that many frames: standard deviations grow with them
             self._num_rejected += 1
             growth = self._num_rejected**2
             motion = dataclasses.replace(motion, covariance=growth * motion.covariance, epistemic=growth * motion.epistemic)
-        T_world_target = self._T_world_source @ motion.T_target_source
-        covariance_world = se3.compose_covariance(self._covariance, motion.covariance, motion.T_target_source)
-        if motion.status != "rejected" and target is not None:
-            if self._source is not None:
-                self._motion_model.update(motion.T_target_source, (stamp_ns - self._source.stamp_ns) * NANOSECOND)
-            self._source, self._num_rejected = target, 0
-            self._T_world_source, self._covariance = T_world_target, covariance_world
-        self._num_frames, self._last_stamp_ns = self._num_frames + 1, stamp_ns
-        frame = Frame(T_world_target, covariance_world, motion, motion.status, stamp_ns, timing)
+        T_world_since, covariance_since = (np.eye(4), np.zeros((6, 6))) if anchor is None else (anchor.T_world_lidar, anchor.covariance)
+        T_world_lidar = T_world_since @ motion.T_target_source
+        covariance_world = se3.compose_covariance(covariance_since, motion.covariance, motion.T_target_source)
+        if target is not None and not rejected:
+            if anchor is not None:
+                self._motion_model.update(motion.T_target_source, (stamp_ns - anchor.source.stamp_ns) * NANOSECOND)
+            self._anchor, self._doubtful, self._num_rejected = Anchor(target, T_world_lidar, covariance_world), None, 0
+        elif target is not None and anchor is not None and target.scan.num_points >= self._params.cfg.status.min_points:
+            self._doubtful = Anchor(target, T_world_lidar, covariance_world)
+        self._num_frames, self._last_stamp_ns = number + 1, stamp_ns
+        since = number if anchor is None else anchor.source.number
+        frame = Frame(T_world_lidar.copy(), covariance_world.copy(), motion, since, motion.status, stamp_ns, timing)
         self._trajectory.append(frame)
         return frame

@@ -19,7 +19,7 @@ from delo_jax.errors import DeloError
 
 FRAME_PERIOD_NS = 100_000_000
 """Time between frames that carry no stamp."""
-COLUMNS = ("index", "stamp_ns", "status", "reason", "confidence")
+COLUMNS = ("index", "since_index", "stamp_ns", "status", "reason", "confidence")
 SIGMA_COLUMNS = ("sigma_rx_deg", "sigma_ry_deg", "sigma_rz_deg", "sigma_x_m", "sigma_y_m", "sigma_z_m")
 
 
@@ -28,13 +28,15 @@ class FrameRecord(NamedTuple):
 
     number: int
     """Of the frame in its run, from 0."""
+    since: int
+    """Number of the frame that the motion starts from: the one before, or the last good one before bad scans."""
     stamp_ns: int
     T_world_lidar: Float64[np.ndarray, "4 4"]
     status: str
     reason: str
     confidence: float
     covariance: Float64[np.ndarray, "6 6"]
-    """Of the motion since the frame before, order [omega, v]."""
+    """Of the motion from frame `since` to this one, order [omega, v]."""
     timing: dict[str, float]
     """Stage to seconds."""
 
@@ -43,6 +45,7 @@ class FrameRecord(NamedTuple):
         """Record of the frame with this number; a missing stamp becomes the number times 0.1 s."""
         return cls(
             number=number,
+            since=int(frame.since),
             stamp_ns=number * FRAME_PERIOD_NS if frame.stamp_ns is None else int(frame.stamp_ns),
             T_world_lidar=np.array(frame.T_world_lidar, dtype=np.float64),
             status=str(frame.status),
@@ -88,7 +91,7 @@ def csv_row(record: FrameRecord, timing_names: Sequence[str]) -> str:
     sigmas = np.concatenate([np.rad2deg(record.sigmas[:3]), record.sigmas[3:]])
     timing = [f"{1e3 * record.timing[name]:.3f}" if name in record.timing else "" for name in timing_names]
     reason = " ".join(record.reason.split())  # one frame, one line
-    head = [record.number, record.stamp_ns, record.status, reason, f"{record.confidence:.6g}"]
+    head = [record.number, record.since, record.stamp_ns, record.status, reason, f"{record.confidence:.6g}"]
     return _csv_line([*head, *(f"{sigma:.6g}" for sigma in sigmas), *timing])
 
 

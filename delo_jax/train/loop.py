@@ -38,10 +38,14 @@ class Reporter(Protocol):
 
 
 def phases(cfg: TrainConfig) -> list[tuple[TrainConfig, int]]:
-    """(weights of the losses, number of steps): first matching and pose, then the evidence of the finished solver."""
+    """(weights of the losses, number of steps): first matching and pose, then the evidence of the finished solver.
+
+    A phase whose weights are all 0 has no steps.
+    """
     pose = dataclasses.replace(cfg, evidence_weight=0.0)
     evidence = dataclasses.replace(cfg, coarse_weight=0.0, fine_weight=0.0)
-    return [(pose, cfg.num_steps), (evidence, cfg.num_evidence_steps)]
+    num_pose_steps = cfg.num_steps if cfg.coarse_weight + cfg.fine_weight > 0 else 0
+    return [(pose, num_pose_steps), (evidence, cfg.num_evidence_steps if cfg.evidence_weight > 0 else 0)]
 
 
 def train(cfg: TrainConfig, out: Path, reporter: Reporter) -> tuple[delo.Model, list[GapErrors]]:
@@ -55,6 +59,9 @@ def train(cfg: TrainConfig, out: Path, reporter: Reporter) -> tuple[delo.Model, 
     Returns:
         The model and its errors on the validation worlds.
     """
+    mesh = jax.make_mesh((jax.local_device_count(),), ("batch",), axis_types=(jax.sharding.AxisType.Auto,))
+    if cfg.batch_size % mesh.size:
+        raise ConfigError(f"batch_size: expected a multiple of the {mesh.size} local devices, got {cfg.batch_size}")
     with Checkpoints(out / "checkpoints", cfg) as checkpoints:
         reporter.start("simulating training worlds", cfg.num_scenes)
         training = list(worlds(cfg, out / "worlds", validation=False, on_world=reporter.advance))
@@ -64,15 +71,14 @@ def train(cfg: TrainConfig, out: Path, reporter: Reporter) -> tuple[delo.Model, 
         first = 0
         for phase_cfg, num_steps in phases(cfg):
             if num_steps:
-                params = _run_phase(phase_cfg, num_steps, first, params, training, held_out, checkpoints, reporter)
+                params = _run_phase(phase_cfg, num_steps, first, params, training, held_out, mesh, checkpoints, reporter)
             first += num_steps
     model = delo.Model(jax.device_get(params), cfg.model)
     return model, validate(model, held_out)
 
 
-def _run_phase(cfg, num_steps, first, params, training, held_out, checkpoints, reporter) -> Any:
+def _run_phase(cfg, num_steps, first, params, training, held_out, mesh, checkpoints, reporter) -> Any:
     """Steps `first` to `first + num_steps` with a fresh optimiser; returns the params."""
-    mesh = jax.make_mesh((jax.local_device_count(),), ("batch",), axis_types=(jax.sharding.AxisType.Auto,))
     tx = make_optimizer(cfg, num_steps)
     train_step = make_train_step(cfg, tx)
     state = TrainState(params, tx.init(params), jnp.asarray(first, jnp.int32))
@@ -84,7 +90,10 @@ def _run_phase(cfg, num_steps, first, params, training, held_out, checkpoints, r
         for batch in _batches(cfg, training, mesh, done, first + num_steps):
             state, metrics = train_step(state, batch)
             done += 1
-            reporter.advance(f"loss {float(metrics['loss']):.3f}")
+            loss = float(metrics["loss"])
+            if not np.isfinite(loss):
+                raise ConfigError(f"step {done}: expected a finite loss, got {loss}; lower learning_rate")
+            reporter.advance(f"loss {loss:.3f}")
             if done % cfg.validate_every == 0 or done == first + num_steps:
                 checkpoints.save(done, state)
                 reporter.validated(done, validate(delo.Model(state.params, cfg.model), held_out))
@@ -97,8 +106,6 @@ def _run_phase(cfg, num_steps, first, params, training, held_out, checkpoints, r
 
 def _batches(cfg: TrainConfig, training: list[World], mesh: Mesh, start: int, stop: int) -> Iterator[PairBatch]:
     """Batches of steps `start` to `stop`, made one ahead in a thread; batch number i is the same in every run."""
-    if cfg.batch_size % mesh.size:
-        raise ConfigError(f"batch_size: expected a multiple of the {mesh.size} local devices, got {cfg.batch_size}")
     sharding = NamedSharding(mesh, PartitionSpec("batch"))
 
     def make(step: int) -> PairBatch:

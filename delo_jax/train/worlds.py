@@ -15,7 +15,9 @@ from delo_jax.config import PreprocessConfig, TrainConfig
 from delo_jax.preprocess import Scan, preprocess
 from delo_jax.sim import KINDS, simulate_clip
 
-VALIDATION_SEED = 1_000_000  # training seeds stay below
+SIMULATOR = 1  # counts the changes of `delo_jax.sim` that change a world; stored worlds of another are not used
+VALIDATION_SEED = 1_000_000  # of the first held-out world
+SEEDS_PER_RUN = 2_000_000  # so that runs of different seeds share no world
 SENSORS = ("hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl32e", "os1-128")
 
 
@@ -59,14 +61,14 @@ def worlds(cfg: TrainConfig, folder: Path, *, validation: bool, on_world: Callab
     for index in range(count):
         path = folder / f"{name}_{fingerprint}_{index:05d}.npz"
         if not path.exists():
-            world = make_world(index, seed=seed + cfg.seed * 10_000, num_frames=cfg.num_frames, cfg=cfg.model.preprocess)
+            world = make_world(index, seed=seed + cfg.seed * SEEDS_PER_RUN, num_frames=cfg.num_frames, cfg=cfg.model.preprocess)
             _write(path, world)
         yield _read(path)
         on_world()
 
 
 def _fingerprint(cfg: TrainConfig) -> str:
-    text = json.dumps([asdict(cfg.model.preprocess), cfg.num_frames, cfg.seed])
+    text = json.dumps([SIMULATOR, asdict(cfg.model.preprocess), cfg.num_frames, cfg.seed])
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from delo_jax.config import StatusConfig
+from delo_jax.uncertainty.observability import Observability
 
 
 class Uncertainty(NamedTuple):
@@ -15,17 +16,21 @@ class Uncertainty(NamedTuple):
     covariance: np.ndarray  # (6, 6)
 
 
-def from_evidence(nu: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> Uncertainty:
-    """Moments of the normal-inverse-gamma prediction; the covariance is the diagonal of their sum, not calibrated.
+def from_evidence(gamma: np.ndarray, nu: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> Uncertainty:
+    """Moments of the normal-inverse-gamma prediction, not calibrated.
+
+    The pose is not moved by the expected error gamma, so the covariance is the second moment about the pose: the diagonal of
+    both variances plus gamma gamma^T.
 
     Args:
+        gamma: (6,) expected error [rad, m].
         nu: (6,) virtual observations of the mean.
         alpha: (6,) shape of the variance, above 1.
         beta: (6,) scale of the variance [rad^2, m^2].
     """
     aleatoric = beta / (alpha - 1.0)
     epistemic = aleatoric / nu
-    return Uncertainty(aleatoric, epistemic, np.diag(aleatoric + epistemic))
+    return Uncertainty(aleatoric, epistemic, np.diag(aleatoric + epistemic) + np.outer(gamma, gamma))
 
 
 def unknown(cfg: StatusConfig) -> Uncertainty:
@@ -34,14 +39,14 @@ def unknown(cfg: StatusConfig) -> Uncertainty:
     return Uncertainty(np.zeros(6), sigma**2, np.diag(sigma**2))
 
 
-def widen_along(known: Uncertainty, direction: np.ndarray, cfg: StatusConfig) -> Uncertainty:
-    """The same uncertainty plus that of an unmeasured translation along one direction.
+def widen(known: Uncertainty, seen: Observability, cfg: StatusConfig) -> Uncertainty:
+    """The same uncertainty plus that of an unmeasured motion along every direction that the surfaces do not hold.
 
     Args:
         known: uncertainty of a pose.
-        direction: (3,) unit vector in the frame of the perturbation, the source frame for T_target_source.
-        cfg: standard deviation of a translation that nobody measured.
+        seen: its principal directions, of the same perturbation.
+        cfg: what counts as unheld, and the standard deviation of a translation that nobody measured.
     """
-    extra = np.zeros((6, 6))
-    extra[3:, 3:] = cfg.unknown_translation_m**2 * np.outer(direction, direction)
+    unheld = seen.directions[seen.shares < cfg.min_observability]
+    extra = cfg.unknown_translation_m**2 * unheld.T @ unheld
     return Uncertainty(known.aleatoric, known.epistemic + np.diag(extra), known.covariance + extra)

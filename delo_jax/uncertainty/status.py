@@ -2,9 +2,8 @@
 
 from typing import NamedTuple
 
-import numpy as np
-
 from delo_jax.config import StatusConfig
+from delo_jax.uncertainty.observability import Observability
 
 STATUSES = ("ok", "low_confidence", "degenerate", "rejected")
 
@@ -22,8 +21,7 @@ def judge(
     num_points: tuple[int, int],
     finite: bool,
     confidence: float,
-    observability: np.ndarray,
-    weakest_axis: np.ndarray,
+    seen: Observability,
     cfg: StatusConfig,
 ) -> Health:
     """Status of a solved pair; the worst that applies.
@@ -32,8 +30,7 @@ def judge(
         num_points: usable points of source and target.
         finite: whether the solver returned numbers.
         confidence: probability that the pair is not lost.
-        observability: (3,) ascending shares of the surface normals per principal direction.
-        weakest_axis: (3,) unit direction in the target frame that is seen worst.
+        seen: how well the surfaces hold each direction.
         cfg: thresholds.
     """
     if min(num_points) < cfg.min_points:
@@ -43,9 +40,9 @@ def judge(
         return Health("rejected", "the solver returned no finite pose", 0.0)
     if confidence < cfg.rejected_confidence:
         return Health("rejected", f"confidence {confidence:.2f} is below {cfg.rejected_confidence:g}", confidence)
-    if observability[0] < cfg.min_observability:
-        axis = ["forward", "lateral", "vertical"][int(np.argmax(np.abs(weakest_axis)))]
-        return Health("degenerate", f"hardly any surface holds the {axis} direction ({observability[0]:.4f})", confidence)
+    if seen.shares[0] < cfg.min_observability:
+        reason = f"hardly any surface holds the {seen.worst()} direction ({seen.shares[0]:.5f} is below {cfg.min_observability:g})"
+        return Health("degenerate", reason, confidence)
     if confidence < cfg.ok_confidence:
         return Health("low_confidence", f"confidence {confidence:.2f} is below {cfg.ok_confidence:g}", confidence)
     return Health("ok", "", confidence)

@@ -1,0 +1,32 @@
+"""Which directions the surfaces of a scan do not hold: corridors, open fields, tunnels."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+LEVER_M = 15.0  # arm by which rotations and translations are made comparable
+AXES = ("roll", "pitch", "yaw", "forward", "lateral", "vertical")
+
+
+class Observability(NamedTuple):
+    """Principal directions of a pose, worst first."""
+
+    shares: np.ndarray  # (6,) ascending: mean squared plane distance per squared metre of motion along the direction
+    directions: np.ndarray  # (6, 6) rows: twists [omega, v] that move the scene by about a metre
+
+    def worst(self) -> str:
+        """Name of the axis that the worst direction is mostly about, in the source frame."""
+        scaled = np.abs(self.directions[0]) * np.repeat([LEVER_M, 1.0], 3)
+        return AXES[int(np.argmax(scaled))]
+
+
+def observability(information: np.ndarray) -> Observability:
+    """Eigenvectors of the information matrix, with rotations measured in metres at an arm of 15 m.
+
+    Args:
+        information: (6, 6) of the planes, for a right perturbation [omega, v], per unit of weight.
+    """
+    scale = np.repeat([1.0 / LEVER_M, 1.0], 3)
+    information = np.asarray(information, np.float64)
+    values, vectors = np.linalg.eigh(scale[:, None] * (0.5 * (information + information.T)) * scale[None, :])
+    return Observability(values, vectors.T * scale)
