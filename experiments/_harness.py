@@ -7,14 +7,18 @@ import platform
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from delo_jax.errors import DeloError
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,22 @@ def finish(rows: list[Row], settings: Any, args: argparse.Namespace) -> int:
     return 0 if args.quick or not missed else 1
 
 
+class Rate(ProgressColumn):
+    """Units per second."""
+
+    def render(self, task: Task) -> Text:
+        """The rate, once there is one."""
+        return Text("" if task.speed is None else f"{task.speed:.1f}/s")
+
+
+def run(main: Callable[[], int]) -> NoReturn:
+    """Exit with the code of `main`; a missing or wrong input ends the script with its sentence, not with a traceback."""
+    try:
+        sys.exit(main())
+    except DeloError as error:
+        sys.exit(str(error))
+
+
 def needed(value: np.ndarray | None, what: str) -> np.ndarray:
     """The value; ends the script with a sentence where the data tree lacks it."""
     if value is None:
@@ -73,7 +93,7 @@ def needed(value: np.ndarray | None, what: str) -> np.ndarray:
 
 def progress() -> Progress:
     """A bar with count and time left, on stderr, so that stdout holds the tables alone."""
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Rate(), TimeRemainingColumn()
     return Progress(*columns, console=Console(file=sys.stderr))
 
 

@@ -100,7 +100,8 @@ def _read_truth(path: Path, facts: dict[str, Any], stamps_ns: np.ndarray) -> np.
     lines = [line.split() for line in read_text(path).splitlines()]
     first = next((words for words in lines if words and not words[0].startswith("#")), [])
     if len(first) != 8:
-        return _to_lidar(read_kitti_poses(path), facts)
+        poses = _to_lidar(read_kitti_poses(path), facts)
+        return poses if facts.get("state") == "complete" else poses[: len(stamps_ns)]  # an interrupted run has fewer frames
     true_ns, poses = read_tum(path)
     order = np.argsort(true_ns, kind="stable")
     true_ns, poses = true_ns[order], poses[order]

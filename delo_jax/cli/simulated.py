@@ -20,7 +20,8 @@ class SimulatedDrive:
         self.stamps_ns = PERIOD_NS * np.arange(num_scans)
         self.paths = tuple(f"simulated scan {index}" for index in range(num_scans))
         self.kept: dict[int, RawScan] = {}
-        """Every tenth scan, for a picture of the scene."""
+        """A dozen scans of the drive, for a picture of the scene."""
+        self._stride = max(1, num_scans // 12)
 
     def __len__(self) -> int:
         """Number of scans of the whole drive."""
@@ -31,7 +32,7 @@ class SimulatedDrive:
         scan = next(self._drive)
         self._Ts_world_lidar.append(scan.T_world_lidar)
         raw = RawScan(scan.points, scan.times_s)
-        if index % 10 == 0:
+        if index % self._stride == 0:
             self.kept[index] = raw
         return raw
 

@@ -206,10 +206,3 @@ def rotation_angle(R: Float[AnyArray, "*b 3 3"]) -> Float[AnyArray, "*b"]:
     positive = sin2 > 0
     twice_sin = xp.where(positive, xp.sqrt(xp.where(positive, sin2, 1.0)), 0.0)
     return xp.asarray(xp.arctan2(twice_sin, R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0))
-
-
-def interpolate(T: Float[AnyArray, "4 4"], fraction: float | Float[AnyArray, "*b"]) -> Float[AnyArray, "*b 4 4"]:
-    """Poses `exp(fraction log T)` along the screw motion from the identity (0) to T (1); extrapolates."""
-    xp = _namespace(T)
-    share = xp.asarray(fraction, dtype=T.dtype)[..., None]
-    return exp(share * log(T).reshape((1,) * (share.ndim - 1) + (6,)))

@@ -9,10 +9,9 @@ from jaxtyping import Array, Bool, Float
 from delo_jax.config import CoarseConfig
 from delo_jax.geometry import se3
 from delo_jax.geometry.procrustes import planar_procrustes
+from delo_jax.geometry.se3 import full_float32
 from delo_jax.ops.consistency import consistency_weights
 from delo_jax.ops.transport import partial_transport
-
-full_float32 = jax.default_matmul_precision("highest")
 
 
 class CoarsePose(NamedTuple):

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Key
 from delo_jax.config import NUM_FEATURES, DeloConfig
 from delo_jax.geometry import se3
 from delo_jax.geometry.point_to_plane import point_to_plane_step
+from delo_jax.geometry.se3 import full_float32
 from delo_jax.model import fine
 from delo_jax.model.coarse import CoarsePose, coarse_pose
 from delo_jax.model.dgcnn import EdgeEncoder
@@ -20,8 +21,6 @@ from delo_jax.model.statistics import NUM_STATISTICS, consensus, statistics
 from delo_jax.ops import evidence
 from delo_jax.ops.knn import knn
 from delo_jax.ops.transport import matching_cost
-
-full_float32 = jax.default_matmul_precision("highest")
 
 
 class Network(nn.Module):

@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float
 from delo_jax.config import FineConfig
 from delo_jax.geometry import se3
 from delo_jax.geometry.point_to_plane import point_to_plane_step
+from delo_jax.geometry.se3 import full_float32
 from delo_jax.ops.knn import nearest
 
-full_float32 = jax.default_matmul_precision("highest")
 MAX_TANGENTIAL = 0.1  # the learned point-to-point term stays small against point-to-plane
 
 

@@ -1,4 +1,4 @@
-"""Soft matching of two feature sets: costs, the row softmax, partial optimal transport."""
+"""Soft matching of two feature sets: costs, partial optimal transport."""
 
 import jax
 import jax.numpy as jnp
@@ -10,15 +10,6 @@ _FORBIDDEN = -1e30  # log-weight of a padded pair; finite, so that no difference
 
 def _mask_columns(scores, column_mask):
     return scores if column_mask is None else jnp.where(column_mask[None, :], scores, _FORBIDDEN)
-
-
-def row_softmax(scores: Float[Array, "n m"], column_mask: Bool[Array, " m"] | None = None) -> Float[Array, "n m"]:
-    """Softmax of each row over its valid columns; zero in the others, and everywhere when none is valid.
-
-    With scores of features this is the soft pointer of Deep Closest Point.
-    """
-    plan = jax.nn.softmax(_mask_columns(scores, column_mask), axis=1)
-    return plan if column_mask is None else jnp.where(column_mask[None, :], plan, 0.0)
 
 
 def matching_cost(

@@ -174,12 +174,3 @@ def test_ros_order():
     assert ros[0] == covariance[3, 3]  # x, x
     assert ros[1 * 6 + 5] == covariance[4, 2]  # y, yaw
     np.testing.assert_array_equal(se3.to_ros_covariance(jnp.asarray(covariance)), ros)
-
-
-def test_interpolate_is_a_screw_motion():
-    """Oracle: gtsam Expmap of a share of its Logmap; the ends are the identity and T."""
-    T, fractions = random_pose(0), np.array([0.0, 0.25, 1.0, 1.5])
-    expected = [gtsam.Pose3.Expmap(s * gtsam.Pose3.Logmap(gtsam.Pose3(T))).matrix() for s in fractions]
-    np.testing.assert_allclose(se3.interpolate(T, fractions), expected, atol=1e-12)
-    np.testing.assert_allclose(se3.interpolate(T, 0.25), expected[1], atol=1e-12)
-    np.testing.assert_allclose(se3.interpolate(jnp.asarray(T, jnp.float32), jnp.asarray(fractions, jnp.float32)), expected, atol=1e-5)
