@@ -18,7 +18,7 @@ import small_gicp
 from _harness import Row
 
 import delo_jax
-from delo_jax.data.writers import camera_to_lidar, read_kitti_poses
+from delo_jax.data import camera_to_lidar, read_kitti_poses
 from delo_jax.geometry import se3
 from delo_jax.metrics.registration import pose_errors
 

@@ -25,7 +25,7 @@ from delo_jax.errors import ConfigError
 ALL = [PreprocessConfig, CoarseConfig, FineConfig, EvidenceConfig, StatusConfig, DeloConfig, TrainConfig]
 CHANGED = TrainConfig(
     model=DeloConfig(name="it's", coarse=CoarseConfig(mass=1.0), evidence=EvidenceConfig(rotation_scale_rad=1e-30)),
-    seed=-3,
+    seed=3,
     learning_rate=1e22,
 )
 
@@ -97,14 +97,24 @@ def test_wrong_type_is_refused(table, message):
         (PreprocessConfig, {"voxel_m": 0.0}),
         (PreprocessConfig, {"voxel_m": 0.8}),
         (PreprocessConfig, {"num_neighbors": 4}),
+        (PreprocessConfig, {"keypoint_voxel_m": 0.0}),
+        (PreprocessConfig, {"keypoint_range_m": -1.0}),
         (PreprocessConfig, {"ground_share": 0.0}),
         (PreprocessConfig, {"num_keypoints": 0}),
         (PreprocessConfig, {"num_keypoints": 4000}),
         (CoarseConfig, {"mass": 0.0}),
         (CoarseConfig, {"mass": 1.01}),
         (CoarseConfig, {"num_iters": 0}),
+        (CoarseConfig, {"num_neighbors": 0}),
+        (CoarseConfig, {"edge_scale_m": 0.0}),
+        (CoarseConfig, {"width": 0}),
+        (CoarseConfig, {"embedding_dim": 0}),
+        (CoarseConfig, {"consistency_m": float("nan")}),
         (FineConfig, {"num_points": 15}),
         (FineConfig, {"num_iters": 1}),
+        (EvidenceConfig, {"width": 0}),
+        (EvidenceConfig, {"rotation_scale_rad": 0.0}),
+        (EvidenceConfig, {"translation_scale_m": -1.0}),
         (StatusConfig, {"ok_confidence": 1.5}),
         (StatusConfig, {"rejected_confidence": 0.9}),
         (DeloConfig, {"coarse": CoarseConfig(num_neighbors=400)}),
@@ -112,6 +122,17 @@ def test_wrong_type_is_refused(table, message):
         (TrainConfig, {"num_scenes": 0}),
         (TrainConfig, {"num_validation_scenes": 0}),
         (TrainConfig, {"batch_size": 0}),
+        (TrainConfig, {"num_points": 0}),
+        (TrainConfig, {"learning_rate": 0.0}),
+        (TrainConfig, {"learning_rate": float("nan")}),
+        (TrainConfig, {"seed": -1}),
+        (TrainConfig, {"num_steps": 9}),
+        (TrainConfig, {"num_steps": -10}),
+        (TrainConfig, {"num_evidence_steps": 1}),
+        (TrainConfig, {"coarse_weight": -1.0}),
+        (TrainConfig, {"fine_weight": -1.0}),
+        (TrainConfig, {"evidence_weight": float("nan")}),
+        (TrainConfig, {"regulariser_weight": -1.0}),
         (TrainConfig, {"num_iters": 5}),
         (TrainConfig, {"validate_every": 0}),
     ],
@@ -120,6 +141,12 @@ def test_value_out_of_range_is_refused_by_name(cls, values):
     """Oracle: the documented ranges; the message names the field that was given, or the one it collides with."""
     with pytest.raises(ConfigError, match=r"^[a-z_.]+: expected .*, got "):
         cls(**values)
+
+
+@pytest.mark.parametrize("values", [{"num_steps": 0}, {"num_steps": 10}, {"num_evidence_steps": 0}, {"evidence_weight": 0.0}, {"seed": 0}])
+def test_value_at_the_edge_is_taken(values):
+    """Oracle: the documented ranges."""
+    assert dataclasses.asdict(TrainConfig(**values)).items() >= values.items()
 
 
 def test_unreadable_files_are_one_sentence(tmp_path):

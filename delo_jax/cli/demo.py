@@ -65,7 +65,7 @@ class Demo(Command):
 
     def _draw_scene(self, source: "SimulatedDrive", Ts_world_lidar: "np.ndarray") -> None:
         """The map that the estimated poses make of some scans."""
-        from delo_jax.cli.simulated import PERIOD_NS
+        from delo_jax.data.fields import FRAME_PERIOD_NS
         from delo_jax.geometry import se3
         from delo_jax.pipeline.motion_model import ConstantVelocity
         from delo_jax.report.figures import scene_figure
@@ -75,7 +75,7 @@ class Demo(Command):
             if not 0 < index < len(Ts_world_lidar) or scan.times is None:
                 continue
             motion = ConstantVelocity()
-            motion.update(se3.inverse(Ts_world_lidar[index - 1]) @ Ts_world_lidar[index], 1e-9 * PERIOD_NS)
+            motion.update(se3.inverse(Ts_world_lidar[index - 1]) @ Ts_world_lidar[index], 1e-9 * FRAME_PERIOD_NS)
             clouds[index] = motion.deskew(scan.points, scan.times)
         if clouds:
             title = f"{len(clouds)} scans at the poses estimated"

@@ -68,6 +68,5 @@ class Simulate(Command):
         if count < self.num_scans:
             print(f"delo: interrupted; {count} of {self.num_scans} scans are kept in {self.out / 'sequences' / name}", file=sys.stderr)
             return 1
-        deskew = " --deskew on" if self.rolling_shutter else ""
-        print(f"odometry on it:  delo run {self.out} --sequence {name}{deskew}")
+        print(f"odometry on it:  delo run {self.out} --sequence {name}")
         return 0

@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from delo_jax.data.fields import RawScan
+from delo_jax.data.fields import FRAME_PERIOD_NS, RawScan
 from delo_jax.sim import simulate_drive
-
-PERIOD_NS = 100_000_000
 
 
 class SimulatedDrive:
@@ -17,7 +15,7 @@ class SimulatedDrive:
     def __init__(self, kind: str, seed: int, num_scans: int):
         self._drive = simulate_drive(kind, seed, num_scans, rolling_shutter=True)
         self._Ts_world_lidar: list[np.ndarray] = []
-        self.stamps_ns = PERIOD_NS * np.arange(num_scans)
+        self.stamps_ns = FRAME_PERIOD_NS * np.arange(num_scans)
         self.paths = tuple(f"simulated scan {index}" for index in range(num_scans))
         self.kept: dict[int, RawScan] = {}
         """A dozen scans of the drive, for a picture of the scene."""

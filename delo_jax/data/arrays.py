@@ -26,7 +26,7 @@ def parse_npy(data: bytes) -> RawScan:
 
 
 def parse_npz(data: bytes) -> RawScan:
-    """Scan of a .npz file: points under one of `POINT_KEYS` or as x, y, z; times under one of `TIME_NAMES`.
+    """Scan of a .npz file: points under one of `POINT_KEYS` or as x, y, z; times under the first of `TIME_NAMES` with more than one value.
 
     Raises:
         ScanError: damaged, no such key, or times of another length than the points.
@@ -37,7 +37,6 @@ def parse_npz(data: bytes) -> RawScan:
     except Exception as error:  # zipfile raises half a dozen types on damaged archives
         raise ScanError(f"expected a .npz archive, got {error}; the file is damaged") from None
     key = next((key for key in POINT_KEYS if key in members), None)
-    time_key = next((key for key in TIME_NAMES if key in members), None)
     if key is not None:
         scan = _scan_from_array(_array(_member(archive, members[key])))
     elif {"x", "y", "z"} <= members.keys():
@@ -47,9 +46,10 @@ def parse_npz(data: bytes) -> RawScan:
         scan = scan_from_fields(columns)
     else:
         raise ScanError(f"expected points under a key such as 'xyz' or 'points', got {', '.join(members) or 'no arrays'}; rename it")
-    if time_key is None:
+    candidates = ((key, _array(_member(archive, members[key])).reshape(-1)) for key in TIME_NAMES if key in members)
+    time_key, times = next(((key, times) for key, times in candidates if len(times) > 1), (None, None))  # a single one is the scan's stamp
+    if times is None:
         return scan
-    times = _array(_member(archive, members[time_key])).reshape(-1)
     if len(times) != len(scan.points) or times.dtype.kind not in "iuf":
         raise ScanError(f"expected one number in {time_key!r} per point ({len(scan.points)}), got {len(times)}; save them together")
     return RawScan(scan.points, relative_times(times, is_return=scan.points.any(axis=-1)))

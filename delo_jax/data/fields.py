@@ -10,14 +10,17 @@ from delo_jax.errors import ScanError
 
 TIME_NAMES = ("t", "time", "times", "timestamp", "timestamps", "offset", "offset_time", "time_offset", "point_time")
 UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # s, ms, us, ns
-LONGEST_SWEEP = 2.0  # s
+MAX_SWEEP_S = 1.0
+"""Farthest from its stamp that a point of a scan is measured; a larger time is one of a clock."""
+FRAME_PERIOD_NS = 100_000_000
+"""Time between scans that carry no stamp."""
 
 
 class RawScan(NamedTuple):
     """One sweep as its file holds it, nothing filtered.
 
-    The stamp of a scan is the middle of its sweep: `times` are negative in the first half and positive in the second. Files whose
-    times start at 0, end at 0 or count from an epoch are shifted to that convention; files whose times straddle zero are not.
+    Stored times that are offsets are relative to the stamp, wherever in the sweep that is, and are delivered as they are. Times of a
+    clock say nothing of the stamp: it is taken to be the middle of the sweep.
     """
 
     points: Float32[np.ndarray, "n 3"]
@@ -42,13 +45,14 @@ def scan_from_fields(fields: Mapping[str, np.ndarray]) -> RawScan:
 
 
 def relative_times(values: np.ndarray, *, is_return: Bool[np.ndarray, " n"]) -> Float64[np.ndarray, " n"] | None:
-    """Point times in seconds relative to the middle of the sweep; the shift is left out where they straddle zero already.
+    """Point times in seconds relative to the stamp of the scan.
 
-    The unit is the coarsest of s, ms, us, ns in which the sweep lasts at most 2 s; integers are never seconds.
+    The unit is the coarsest of s, ms, us, ns in which the sweep lasts at most 2 s; integers are never seconds. Times within 1 s of 0 are
+    offsets from the stamp and stay as they are; larger ones count from an epoch and become relative to the middle of the sweep.
 
     Args:
         values: (n,) times of any unit and origin.
-        is_return: rows that hold a measured point; others may carry a time of 0 amid absolute ones, and get 0 here.
+        is_return: rows that hold a measured point; others may carry a time of 0 amid absolute ones, and get the sweep's middle.
 
     Returns:
         Finite times [s], or None where the values do not differ or fit no unit.
@@ -59,11 +63,12 @@ def relative_times(values: np.ndarray, *, is_return: Bool[np.ndarray, " n"]) -> 
     if not known.any():
         return None
     low, high = values[known].min(), values[known].max()
-    unit = next((unit for unit in units if (high - low) * unit <= LONGEST_SWEEP), None)
+    unit = next((unit for unit in units if (high - low) * unit <= 2 * MAX_SWEEP_S), None)
     if unit is None or low == high:
         return None
-    middle = 0.0 if low < 0.0 < high else low + (high - low) / 2
-    return np.where(known, (values - middle) * unit, 0.0)
+    middle = low + (high - low) / 2
+    origin = 0.0 if max(-low, high) * unit <= MAX_SWEEP_S else middle
+    return (np.where(known, values, middle) - origin) * unit
 
 
 def parse_ascii(tokens: Sequence[bytes], dtypes: Sequence[np.dtype], *, num_rows: int) -> list[np.ndarray]:

@@ -9,18 +9,20 @@ import numpy as np
 from delo_jax.data.kitti import increasing_or_none
 from delo_jax.data.poses import parse_seconds, read_kitti_poses, read_times, relative_to_first
 from delo_jax.data.scans import SUFFIXES, read_scan
-from delo_jax.data.sequence import Dataset
+from delo_jax.data.sequence import Dataset, median_spacing_s
 from delo_jax.errors import DatasetError, ScanError
 
 _MIN_STEP = 1_000_000  # ns between scans: frame numbers step by less
 _MICROSECONDS_SINCE_1970 = 10**15
+_LONGEST_SWEEP = 1.5  # spacings of the stamps
 
 
 def open_folder(folder: Path, *, azimuth_times: bool) -> Dataset:
     """All scans of the folder's most frequent format, in natural order; nothing is corrected.
 
     Stamps: times.txt (seconds) where it has one line a scan, else the file names where they are decimal seconds, integer nanoseconds
-    or integer microseconds since 1970. Truth: poses.txt (KITTI rows, in the sensor's frame) where it has one line a scan.
+    or integer microseconds since 1970. Truth: poses.txt (KITTI rows, in the sensor's frame) where it has one line a scan. Stored times
+    are left out where they last longer than the stamps allow, and are relative to mid-sweep where they do not start over in each scan.
 
     Raises:
         DatasetError: no scans.
@@ -36,17 +38,19 @@ def open_folder(folder: Path, *, azimuth_times: bool) -> Dataset:
         order = np.argsort(by_name, kind="stable")
         paths, by_name = [paths[i] for i in order], by_name[order]
     stamps_ns = _one_per_scan(folder / "times.txt", read_times, count, notes)
-    stamps_ns = by_name if stamps_ns is None else stamps_ns
     poses = _one_per_scan(folder / "poses.txt", read_kitti_poses, count, notes)
-    stored = suffix != ".bin" and _has_times(paths)
+    stamps_ns = increasing_or_none(by_name if stamps_ns is None else stamps_ns, notes)
+    sweeps = _some_sweeps(paths)
+    stored = len(sweeps) > 0 and _fit(sweeps, median_spacing_s(stamps_ns), notes)
     return Dataset(
         name=folder.resolve().name,
         layout=f"folder of {suffix} scans",
         paths=tuple(paths),
-        stamps_ns=None if stamps_ns is None else increasing_or_none(stamps_ns, notes),
+        stamps_ns=stamps_ns,
         truth=None if poses is None else relative_to_first(poses),
         truth_source="none" if poses is None else f"{folder / 'poses.txt'} (taken to be in the sensor's frame)",
         point_times="stored" if stored else "azimuth" if azimuth_times else "none",
+        center_times=stored and _run_on(sweeps),
         compensated=False if azimuth_times else None,
         notes=tuple(notes),
     )
@@ -84,11 +88,29 @@ def _one_per_scan(path, read, count, notes):
     return None
 
 
-def _has_times(paths):
-    """Whether the first readable scan has times."""
-    for path in paths[:5]:
+def _some_sweeps(paths):
+    """(first, last) point time [s] of the first scans and the last one, of those that can be read and have times."""
+    sweeps = []
+    for path in dict.fromkeys([*paths[:3], paths[-1]]):
         try:
-            return read_scan(path).times is not None
+            times = read_scan(path).times
         except ScanError:
             continue
+        if times is not None:
+            sweeps.append((times.min(), times.max()))
+    return np.array(sweeps)
+
+
+def _fit(sweeps, spacing_s, notes):
+    """Whether the sweeps are about as short as the spacing of the stamps; a note where they are not."""
+    longest_s = np.ptp(sweeps, axis=1).max()
+    if spacing_s is None or longest_s <= _LONGEST_SWEEP * spacing_s:
+        return True
+    notes.append(f"stored point times not used: a sweep lasts {longest_s:.3g} s by them, but scans are {spacing_s:.3g} s apart")
     return False
+
+
+def _run_on(sweeps):
+    """Whether times go on from scan to scan, as those of a recording do; in its first second they look like offsets."""
+    middles = sweeps.mean(axis=1)
+    return bool(np.ptp(middles) > np.ptp(sweeps, axis=1).max() / 4)

@@ -13,7 +13,8 @@ from delo_jax.errors import DatasetError
 def open_odometry(folder: Path, *, elevation_correction: bool, azimuth_times: bool) -> Dataset:
     """KITTI odometry sequence: velodyne/*.bin, times.txt, calib.txt, and poses in ../../poses/<name>.txt or poses.txt.
 
-    A calib.txt may say `elevation_correction_deg: 0` and `motion_compensated: 0` of scans that are not KITTI's own.
+    A calib.txt may say `elevation_correction_deg: 0` and `motion_compensated: 0` of scans that are not KITTI's own. Scans that are not
+    compensated come with times by azimuth.
 
     Raises:
         DatasetError: a file that is there but cannot be used.
@@ -24,15 +25,17 @@ def open_odometry(folder: Path, *, elevation_correction: bool, azimuth_times: bo
     notes: list[str] = []
     truth, stamps_ns, source = None, None, "none"
     if (folder / "times.txt").exists():
-        stamps_ns = _rows(read_times(folder / "times.txt"), paths, folder / "times.txt")
+        stamps_ns = _rows(read_times(folder / "times.txt"), paths, folder / "times.txt", notes)
         stamps_ns = increasing_or_none(stamps_ns, notes)
     poses_files = folder.parent.parent / "poses" / f"{folder.name}.txt", folder / "poses.txt"
     poses_file = next((file for file in poses_files if file.exists()), None)
     if poses_file is not None and T_cam_lidar is None:
         notes.append(f"{poses_file} not used: calib.txt with a row Tr is needed to bring it to the sensor's frame")
     elif poses_file is not None and T_cam_lidar is not None:
-        poses = _rows(read_kitti_poses(poses_file), paths, poses_file)
-        truth, source = relative_to_first(camera_to_lidar(poses, T_cam_lidar)), f"{poses_file} (camera frame, converted with Tr)"
+        poses = _rows(read_kitti_poses(poses_file), paths, poses_file, notes)
+        if poses is not None:
+            truth, source = relative_to_first(camera_to_lidar(poses, T_cam_lidar)), f"{poses_file} (camera frame, converted with Tr)"
+    compensated = bool(calib.get("motion_compensated", [1.0])[0]) and not azimuth_times
     correction = float(calib.get("elevation_correction_deg", [KITTI_ELEVATION_CORRECTION_DEG])[0])
     return Dataset(
         name=folder.name,
@@ -43,8 +46,9 @@ def open_odometry(folder: Path, *, elevation_correction: bool, azimuth_times: bo
         truth_source=source,
         T_cam_lidar=T_cam_lidar,
         elevation_correction_deg=correction if elevation_correction else 0.0,
-        compensated=bool(calib.get("motion_compensated", [1.0])[0]) and not azimuth_times,
-        point_times="azimuth" if azimuth_times else "none",
+        compensated=compensated,
+        point_times="none" if compensated else "azimuth",
+        bin_columns=4,
         notes=tuple(notes),
     )
 
@@ -63,8 +67,8 @@ def open_raw(folder: Path, *, elevation_correction: bool) -> Dataset:
     stamps_file = folder / "velodyne_points" / "timestamps.txt"
     if stamps_file.exists():
         # rows of missing frames may be blank: 0 stands for them, and only the rows of scans that exist are used
-        stamps_ns = _rows(read_timestamps(stamps_file), paths, stamps_file)
-        if not stamps_ns.all():
+        stamps_ns = _rows(read_timestamps(stamps_file), paths, stamps_file, notes)
+        if stamps_ns is not None and not stamps_ns.all():
             raise DatasetError(f"{stamps_file}: expected a time for every scan, got blank lines; copy the file again")
     velo_imu_file = _day_file(folder, "calib_imu_to_velo.txt")
     if stamps_ns is None or velo_imu_file is None or not (folder / "oxts" / "data").is_dir():
@@ -79,13 +83,14 @@ def open_raw(folder: Path, *, elevation_correction: bool) -> Dataset:
         name=folder.name,
         layout="KITTI raw drive",
         paths=tuple(paths),
-        stamps_ns=None if stamps_ns is None else increasing_or_none(stamps_ns, notes),
+        stamps_ns=increasing_or_none(stamps_ns, notes),
         truth=truth,
         truth_source=source,
         T_cam_lidar=_raw_T_cam_lidar(folder, notes),
         elevation_correction_deg=KITTI_ELEVATION_CORRECTION_DEG if elevation_correction else 0.0,
         compensated=False,
         point_times="azimuth",
+        bin_columns=4,
         notes=tuple(notes),
     )
 
@@ -127,8 +132,10 @@ def rigid(calib: dict[str, list[float]], key: str, path: Path) -> np.ndarray:
     return T
 
 
-def increasing_or_none(stamps_ns: np.ndarray, notes: list[str]) -> np.ndarray | None:
+def increasing_or_none(stamps_ns: np.ndarray | None, notes: list[str]) -> np.ndarray | None:
     """The stamps, or None and a note where they do not increase strictly."""
+    if stamps_ns is None:
+        return None
     backward = np.flatnonzero(np.diff(stamps_ns) <= 0)
     if len(backward) == 0:
         return stamps_ns
@@ -136,14 +143,15 @@ def increasing_or_none(stamps_ns: np.ndarray, notes: list[str]) -> np.ndarray | 
     return None
 
 
-def _rows(rows, paths, where):
-    """Rows of a per-frame file that belong to the scans: by frame number where the file is long enough, else one a scan."""
+def _rows(rows, paths, where, notes):
+    """Rows of a per-frame file that belong to the scans: by frame number where the file is long enough, else one a scan, else None."""
     numbers = np.array([int(path.stem) if path.stem.isdecimal() else len(rows) for path in paths])
     if numbers.max() < len(rows):
         return rows[numbers]
     if len(rows) == len(paths):
         return rows
-    raise DatasetError(f"{where}: expected one row for each of {len(paths)} scans, got {len(rows)}; complete the file or remove it")
+    notes.append(f"{where} not used: it has {len(rows)} rows for {len(paths)} scans")
+    return None
 
 
 def _day_file(folder, name):

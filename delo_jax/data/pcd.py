@@ -25,7 +25,7 @@ def parse_pcd(data: bytes) -> dict[str, np.ndarray]:
     The header is never trusted for a size: what it announces has to be in the file before anything is allocated.
 
     Raises:
-        ScanError: damaged header, or fewer data than the header announces.
+        ScanError: damaged header, fewer data than it announces, or more by a whole point.
     """
     header, body = _split(data)
     fields, num_points = _fields(header), _num_points(header)
@@ -34,11 +34,14 @@ def parse_pcd(data: bytes) -> dict[str, np.ndarray]:
     if kind == "ascii":
         _check_size(num_points * sum(field.num_values for field in fields), len(body))  # a number has a digit at least
         dtypes = [field.dtype for field in fields for _ in range(field.num_values)]
-        columns = parse_ascii(body.split(), dtypes, num_rows=num_points)
+        tokens = body.split()
+        _check_surplus(len(tokens) // len(dtypes), num_points)
+        columns = parse_ascii(tokens, dtypes, num_rows=num_points)
         firsts = itertools.accumulate((field.num_values for field in fields[:-1]), initial=0)
         table = [columns[first] for first in firsts]
     elif kind == "binary":
         _check_size(num_points * point_size, len(body))
+        _check_surplus(len(body) // point_size, num_points)
         dtype = np.dtype([(str(i), field.dtype, (field.num_values,)) for i, field in enumerate(fields)])
         points = np.frombuffer(body, dtype, num_points)
         table = [points[str(i)][:, 0] for i in range(len(fields))]
@@ -79,9 +82,11 @@ def _fields(header):
 
 
 def _num_points(header):
-    if "POINTS" in header:
-        return _integer(" ".join(header["POINTS"]), "POINTS")
-    return _integer(" ".join(header.get("WIDTH", [])), "WIDTH") * _integer(" ".join(header.get("HEIGHT", [])), "HEIGHT")
+    width, height = (_integer(" ".join(header.get(key, [])), key) for key in ("WIDTH", "HEIGHT"))
+    points = _integer(" ".join(header.get("POINTS", [str(width * height)])), "POINTS")
+    if points != width * height:
+        raise ScanError(f"expected POINTS to be WIDTH x HEIGHT ({width * height}), got {points}; the header is wrong")
+    return points
 
 
 def _integer(text, key):
@@ -94,6 +99,11 @@ def _integer(text, key):
 def _check_size(needed, available):
     if needed > available:
         raise ScanError(f"expected {needed} bytes of points, got {available}; the file is cut short or its header wrong")
+
+
+def _check_surplus(available, announced):
+    if available > announced:
+        raise ScanError(f"expected {announced} points, got {available}; the header is wrong or the file damaged")
 
 
 def _split_columns(raw, fields, num_points):

@@ -11,13 +11,16 @@ from delo_jax.data.ply import parse_ply
 from delo_jax.errors import ScanError
 
 BIN_COLUMNS = (4, 5, 3, 6)  # in order of preference
-_BLOCK = 60  # their least common multiple: blocks of it keep every column in place
-_SIX_COLUMN_HANDICAP = 0.8  # interleaved rings make x y z x y z unlike too: 0.5 on an HDL-32; six true columns differ by 1.1 and more
+_COUNTS = range(2, 13)  # those told apart
+_BLOCK = 60  # rows, or values where there are no rows yet
+# Two columns are no worse than four for a table of two, and 0.9 or more worse for a true four. Interleaved rings make x y z x y z
+# unlike too, and x y z i x y z i: by up to 0.5 on an HDL-32; true columns differ by 1.1 and more.
+_HANDICAPS = {columns: -0.3 if columns == 2 else 0.0 if columns < 6 else 0.8 for columns in _COUNTS}
 _MAX_BYTES = 1 << 31
 _NEAREST, _FARTHEST = 1e-3, 1e4  # m
 
 
-def read_scan(path: str | Path) -> RawScan:
+def read_scan(path: str | Path, *, bin_columns: int | None = None) -> RawScan:
     """Points, and their times where the file has them, of one scan.
 
     Formats, by suffix: .bin (float32 rows, see `parse_bin`), .pcd (ASCII, binary, binary_compressed), .ply (ASCII, binary), .npy
@@ -25,37 +28,43 @@ def read_scan(path: str | Path) -> RawScan:
 
     Args:
         path: the file.
+        bin_columns: columns that a .bin must have, where that is known.
 
     Returns:
-        Points in the sensor frame [m], unfiltered, and times relative to the middle of the sweep [s].
+        Points in the sensor frame [m], unfiltered, and times relative to the stamp [s].
 
     Raises:
         ScanError: missing, empty, unreadable, damaged or of another content; one sentence that names the file.
     """
     path = Path(path)
-    parse = _PARSERS.get(path.suffix.lower())
-    if parse is None:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
         raise ScanError(f"{path}: expected a scan file ({', '.join(SUFFIXES)}), got {path.suffix!r}; convert it first")
     try:
         with np.errstate(all="ignore"):  # damaged values overflow; preprocessing drops what is not finite
-            return parse(_read_bytes(path))
+            data = _read_bytes(path)
+            return parse_bin(data, columns=bin_columns) if suffix == ".bin" else _PARSERS[suffix](data)
     except ScanError as error:
         raise ScanError(f"{path}: {error}") from None
 
 
-def parse_bin(data: bytes) -> RawScan:
+def parse_bin(data: bytes, *, columns: int | None = None) -> RawScan:
     """Scan of raw little-endian float32 rows: x y z, then 0 to 3 more columns (KITTI 4, nuScenes 5).
 
     The file does not say how many columns it has. We take the count that keeps unlike quantities apart: for the true count each column
     is one quantity, for a wrong one it is a mixture, whose log variance is larger (Jensen). Counts within the noise of the best are
-    ties, and go to the first of 4, 5, 3, 6 of which the file is whole rows (six columns have to be clearly better than three). In
-    files of less than 60 values all counts are ties.
+    ties, and go to the first of 4, 5, 3, 6 of which the file is whole rows (six columns have to be clearly better than three). A file
+    that is clearly of another count, up to twelve, is refused. In files of less than 60 values all counts are ties.
+
+    Args:
+        data: the file.
+        columns: the count, where it is known; a file that is clearly of another one is refused.
 
     Raises:
         ScanError: empty, not whole rows of that count, or values that are no coordinates in metres.
     """
     values = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
-    columns = _num_columns(values, len(data))
+    columns = _num_columns(values, len(data), BIN_COLUMNS if columns is None else (columns,))
     if len(data) % (4 * columns):
         raise ScanError(
             f"expected whole points of {columns} float32 values ({4 * columns} bytes each), got {len(data)} bytes; "
@@ -71,20 +80,30 @@ def parse_bin(data: bytes) -> RawScan:
     return RawScan(points, None)
 
 
-def _num_columns(values, num_bytes):
-    likely = BIN_COLUMNS if len(values) < _BLOCK else _likely_columns(values)
-    return next((columns for columns in likely if num_bytes % (4 * columns) == 0), likely[0])
+def _num_columns(values, num_bytes, accepted):
+    """The first of the accepted counts that may be the true one and makes whole rows, else the first that may be the true one."""
+    likely = _likely_columns(values)
+    usable = [columns for columns in accepted if columns in likely]
+    if not usable:
+        wanted, got = " or ".join(map(str, sorted(accepted))), likely[0]
+        raise ScanError(f"expected rows of {wanted} float32 values, got values that look like rows of {got}; write x y z reflectance")
+    return next((columns for columns in usable if num_bytes % (4 * columns) == 0), usable[0])
 
 
 def _likely_columns(values):
-    """Column counts whose score is within the noise of the best, in order of preference."""
-    blocks = values[: len(values) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)
-    blocks = blocks[:: max(1, len(blocks) // 1000)]
-    sample = np.clip(np.nan_to_num(blocks, nan=0.0), -_FARTHEST, _FARTHEST)
-    scores = [float(np.mean(np.log(sample.reshape(-1, columns).var(axis=0, dtype=np.float64) + 1e-6))) for columns in BIN_COLUMNS]
-    scores[BIN_COLUMNS.index(6)] += _SIX_COLUMN_HANDICAP
-    noise = max(0.1, 4.0 / np.sqrt(sample.size / 4))  # of a log variance over that many rows
-    return [columns for columns, score in zip(BIN_COLUMNS, scores, strict=True) if score <= min(scores) + noise]
+    """Column counts whose score is within the noise of the best, in order; all where there is nothing to tell them by."""
+    if len(values) < _BLOCK or not (np.abs(values) > _NEAREST).any():
+        return list(_COUNTS)
+    every = max(1, len(values) // 60_000)
+    scores = {}
+    for columns in _COUNTS:
+        rows = values[: len(values) // columns * columns].reshape(-1, columns)
+        rows = rows[np.arange(len(rows)) // _BLOCK % every == 0]  # rows in a block take every phase of a wrong count
+        sample = np.clip(np.nan_to_num(rows, nan=0.0), -_FARTHEST, _FARTHEST)
+        scores[columns] = float(np.mean(np.log(sample.var(axis=0, dtype=np.float64) + 1e-6))) + _HANDICAPS[columns]
+    noise = max(0.1, 8.0 / np.sqrt(min(len(values), 60_000)))  # of a log variance over that many rows of four
+    limit = min(scores.values()) + noise
+    return [columns for columns in _COUNTS if scores[columns] <= limit]
 
 
 def _read_bytes(path):
@@ -102,10 +121,9 @@ def _read_bytes(path):
 
 
 _PARSERS = {
-    ".bin": parse_bin,
     ".pcd": lambda data: scan_from_fields(parse_pcd(data)),
     ".ply": lambda data: scan_from_fields(parse_ply(data)),
     ".npy": parse_npy,
     ".npz": parse_npz,
 }
-SUFFIXES = tuple(_PARSERS)
+SUFFIXES = (".bin", *_PARSERS)

@@ -11,7 +11,8 @@ from delo_jax.data.fields import RawScan
 from delo_jax.data.scans import read_scan
 
 KITTI_ELEVATION_CORRECTION_DEG = 0.205
-SWEEP_SECONDS = 0.1035  # one turn of KITTI's HDL-64
+KITTI_SWEEP_S = 0.1035  # one turn of its HDL-64
+_SHORTEST_SPACING_S, _LONGEST_SPACING_S = 0.03, 0.3  # of stamps that tell how long a turn takes
 
 
 def correct_elevation(points: Float32[np.ndarray, "n 3"], angle_deg: float) -> Float32[np.ndarray, "n 3"]:
@@ -32,11 +33,21 @@ def correct_elevation(points: Float32[np.ndarray, "n 3"], angle_deg: float) -> F
         return np.stack([x * shrink, y * shrink, sin * horizontal + cos * z], axis=-1)
 
 
-def azimuth_times(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-    """Times [s] relative to the stamp of a sensor that turns clockwise, starts and ends behind and is stamped when it looks ahead."""
+def azimuth_times(points: Float32[np.ndarray, "n 3"], *, sweep_s: float = KITTI_SWEEP_S) -> Float64[np.ndarray, " n"]:
+    """Times [s] relative to the stamp of a sensor that turns clockwise, starts and ends behind and is stamped when it looks ahead.
+
+    Args:
+        points: sensor frame [m]; those that are not finite get 0.
+        sweep_s: how long a turn takes.
+    """
     with np.errstate(invalid="ignore"):
         azimuth = np.arctan2(points[:, 1], points[:, 0])
-    return np.nan_to_num(azimuth, nan=0.0).astype(np.float64) / (-2 * np.pi) * SWEEP_SECONDS
+    return np.nan_to_num(azimuth, nan=0.0).astype(np.float64) / (-2 * np.pi) * sweep_s
+
+
+def median_spacing_s(stamps_ns: Int64[np.ndarray, " n"] | None) -> float | None:
+    """Median time between neighbouring scans; None where there are no two stamps."""
+    return None if stamps_ns is None or len(stamps_ns) < 2 else float(np.median(np.diff(stamps_ns))) * 1e-9
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,8 +70,18 @@ class Dataset:
     """Whether the scans are motion-compensated; None where unknown."""
     point_times: str = "none"
     """'none', 'stored' or 'azimuth': where the times of a scan come from."""
+    center_times: bool = False
+    """Stored times are of a clock that runs on from scan to scan: deliver them relative to the middle of each sweep."""
+    bin_columns: int | None = None
+    """Columns that .bin scans must have; None where they tell themselves."""
     notes: tuple[str, ...] = ()
     """Things a user should know, such as files that were left out."""
+
+    @property
+    def sweep_s(self) -> float:
+        """How long a turn of the sensor takes: the median spacing of the stamps, else that of KITTI."""
+        spacing_s = median_spacing_s(self.stamps_ns)
+        return spacing_s if spacing_s and _SHORTEST_SPACING_S <= spacing_s <= _LONGEST_SPACING_S else KITTI_SWEEP_S
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -73,12 +94,14 @@ class Dataset:
             ScanError: the file cannot be used.
             IndexError: no such scan.
         """
-        points, times = read_scan(self.paths[index])
+        points, times = read_scan(self.paths[index], bin_columns=self.bin_columns)
         if self.elevation_correction_deg:
             points = correct_elevation(points, self.elevation_correction_deg)
-        if times is None and self.point_times == "azimuth":
-            times = azimuth_times(points)
-        return RawScan(points, times)
+        if self.point_times == "azimuth":
+            return RawScan(points, azimuth_times(points, sweep_s=self.sweep_s))
+        if self.point_times == "none" or times is None:
+            return RawScan(points, None)
+        return RawScan(points, times - (times.min() + times.max()) / 2 if self.center_times else times)
 
     def __iter__(self) -> Iterator[RawScan]:
         """Scans in order."""
@@ -89,8 +112,8 @@ class Dataset:
         lines = [f"{self.layout}: {self.name}, {len(self)} scans"]
         if self.stamps_ns is None:
             lines.append("stamps: none (index times 0.1 s)")
-        elif len(self) > 1:
-            lines.append(f"stamps: one per scan, {np.median(np.diff(self.stamps_ns)) / 1e6:.1f} ms apart (median)")
+        elif (spacing_s := median_spacing_s(self.stamps_ns)) is not None:
+            lines.append(f"stamps: one per scan, {1e3 * spacing_s:.1f} ms apart (median)")
         if self.truth is None:
             lines.append("truth: none")
         else:

@@ -1,32 +1,13 @@
-"""Writes scans and KITTI odometry trees; trajectory files are in `poses` and can be had from here as well."""
+"""Writes scans and KITTI odometry trees; trajectory files are written by `poses`."""
 
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from delo_jax.data.poses import (
-    camera_to_lidar,
-    format_kitti_pose,
-    format_seconds,
-    lidar_to_camera,
-    read_kitti_poses,
-    read_tum,
-    write_kitti_poses,
-    write_tum,
-)
+from delo_jax.data.fields import FRAME_PERIOD_NS
+from delo_jax.data.poses import format_kitti_pose, format_seconds, lidar_to_camera
 from delo_jax.errors import DatasetError, ScanError
-
-__all__ = [
-    "KittiTreeWriter",
-    "camera_to_lidar",
-    "lidar_to_camera",
-    "read_kitti_poses",
-    "read_tum",
-    "write_bin",
-    "write_kitti_poses",
-    "write_tum",
-]
 
 # x_cam = -y, y_cam = -z, z_cam = x, with offsets like those of KITTI's car
 KITTI_LIKE_T_CAM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]])
@@ -48,7 +29,8 @@ def write_bin(path: str | Path, points: Shaped[np.ndarray, "n columns"]) -> None
 class KittiTreeWriter:
     """Writes sequences/<name> and poses/<name>.txt of a KITTI odometry tree, scan by scan; a context manager.
 
-    What was appended is on disk: an interrupted run leaves a tree that `open_dataset` reads. calib.txt holds, beside Tr, what the
+    What was appended is on disk: a run that was interrupted or killed leaves a tree that `open_dataset` reads, for a scan takes its name
+    only after its time and pose are written. calib.txt holds, beside Tr, what the
     scans need: two rows that other readers pass over.
     """
 
@@ -67,7 +49,7 @@ class KittiTreeWriter:
             out: root of the tree; other sequences in it are left alone.
             name: of the sequence.
             T_cam_lidar: calibration to write, in whose camera frame the poses are; a KITTI-like one by default.
-            motion_compensated: whether the scans are.
+            motion_compensated: whether the scans are; if not, they are read back with times by azimuth.
             elevation_correction_deg: what a reader shall add to the elevation: 0.205 for copies of KITTI's own scans.
 
         Raises:
@@ -103,15 +85,18 @@ class KittiTreeWriter:
         Raises:
             ScanError: neither three nor four columns.
         """
-        stamp_ns = self._count * 100_000_000 if stamp_ns is None else stamp_ns
+        stamp_ns = self._count * FRAME_PERIOD_NS if stamp_ns is None else stamp_ns
         if self._count == 0:
             self._first_ns, self._T_first_world = stamp_ns, np.linalg.inv(T_world_lidar)
-        write_bin(self._folder / "velodyne" / f"{self._count:06d}.bin", points)
+        path = self._folder / "velodyne" / f"{self._count:06d}.bin"
+        unnamed = path.with_name(f".{path.name}")
+        write_bin(unnamed, points)
         T_first_lidar = self._T_first_world @ T_world_lidar
         self._poses.write(format_kitti_pose(lidar_to_camera(T_first_lidar[None], self._T_cam_lidar)[0]))
         self._times.write(format_seconds(stamp_ns - self._first_ns) + "\n")
         self._poses.flush()
         self._times.flush()
+        unnamed.rename(path)
         self._count += 1
 
     def __enter__(self) -> "KittiTreeWriter":

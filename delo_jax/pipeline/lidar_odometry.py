@@ -135,12 +135,15 @@ class LidarOdometry:
     def _check_times(self, times_s: np.ndarray | None, num_points: int) -> np.ndarray | None:
         if times_s is None or not self._deskew:
             return None
-        if np.shape(times_s) != (num_points,):
-            raise ScanError(f"times_s: expected one time per point, shape ({num_points},), got {np.shape(times_s)}")
+        times_s = np.asarray(times_s)
+        if times_s.shape != (num_points,):
+            raise ScanError(f"times_s: expected one time per point, shape ({num_points},), got {times_s.shape}")
+        if times_s.dtype.kind not in "fiu":
+            raise ScanError(f"times_s: expected numbers, got dtype {times_s.dtype}; convert to float64")
         farthest_s = np.max(np.abs(times_s), initial=0.0, where=np.isfinite(times_s))
         if farthest_s > MAX_SWEEP_S:
             raise ScanError(f"times_s: expected seconds relative to the stamp, within {MAX_SWEEP_S:g} s, got {farthest_s:g} s")
-        return np.asarray(times_s)
+        return times_s
 
     def _prepare_still(self, sweep: Sweep, motion: ConstantVelocity) -> EncodedScan:
         return self._prepare(self._params, motion.deskew(*sweep))

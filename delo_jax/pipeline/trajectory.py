@@ -14,11 +14,10 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 from scipy.spatial.transform import Rotation
 
+from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.data.poses import format_kitti_pose, format_seconds, lidar_to_camera
 from delo_jax.errors import DeloError
 
-FRAME_PERIOD_NS = 100_000_000
-"""Time between frames that carry no stamp."""
 COLUMNS = ("index", "since_index", "stamp_ns", "status", "reason", "confidence")
 SIGMA_COLUMNS = ("sigma_rx_deg", "sigma_ry_deg", "sigma_rz_deg", "sigma_x_m", "sigma_y_m", "sigma_z_m")
 

@@ -85,7 +85,7 @@ def _run_phase(cfg, num_steps, first, params, training, held_out, mesh, checkpoi
     state = checkpoints.restore(state, first, first + num_steps)
     done = int(state.step)
     state = jax.device_put(state, NamedSharding(mesh, PartitionSpec()))
-    reporter.start("learning poses" if cfg.fine_weight else "learning evidence", num_steps, done - first)
+    reporter.start("learning evidence" if cfg.evidence_weight else "learning poses", num_steps, done - first)
     try:
         for batch in _batches(cfg, training, mesh, done, first + num_steps):
             state, metrics = train_step(state, batch)

@@ -47,6 +47,6 @@ def widen(known: Uncertainty, seen: Observability, cfg: StatusConfig) -> Uncerta
         seen: its principal directions, of the same perturbation.
         cfg: what counts as unheld, and the standard deviation of a translation that nobody measured.
     """
-    unheld = seen.directions[seen.shares < cfg.min_observability]
-    extra = cfg.unknown_translation_m**2 * unheld.T @ unheld
+    unheld = seen.unheld(cfg.min_observability)
+    extra = cfg.unknown_translation_m**2 * (unheld.T @ unheld)
     return Uncertainty(known.aleatoric, known.epistemic + np.diag(extra), known.covariance + extra)

@@ -14,10 +14,14 @@ class Observability(NamedTuple):
     shares: np.ndarray  # (6,) ascending: mean squared plane distance per squared metre of motion along the direction
     directions: np.ndarray  # (6, 6) rows: twists [omega, v] that move the scene by about a metre
 
-    def worst(self) -> str:
-        """Name of the axis that the worst direction is mostly about, in the source frame."""
-        scaled = np.abs(self.directions[0]) * np.repeat([LEVER_M, 1.0], 3)
-        return AXES[int(np.argmax(scaled))]
+    def unheld(self, minimum: float) -> np.ndarray:
+        """(k, 6) directions whose share is below the minimum."""
+        return self.directions[self.shares < minimum]
+
+    def unheld_axes(self, minimum: float) -> list[str]:
+        """Names of the axes, in the source frame, that these directions are mostly about."""
+        parts = np.sum((self.unheld(minimum) * np.repeat([LEVER_M, 1.0], 3)) ** 2, axis=0)  # whatever basis the eigenvectors are
+        return [name for name, part in zip(AXES, parts, strict=True) if part > 0.5 * parts.max()]
 
 
 def observability(information: np.ndarray) -> Observability:

@@ -41,7 +41,8 @@ def judge(
     if confidence < cfg.rejected_confidence:
         return Health("rejected", f"confidence {confidence:.2f} is below {cfg.rejected_confidence:g}", confidence)
     if seen.shares[0] < cfg.min_observability:
-        reason = f"hardly any surface holds the {seen.worst()} direction ({seen.shares[0]:.5f} is below {cfg.min_observability:g})"
+        axes = ", ".join(seen.unheld_axes(cfg.min_observability))
+        reason = f"hardly any surface holds {axes} ({max(seen.shares[0], 0.0):.5f} is below {cfg.min_observability:g})"
         return Health("degenerate", reason, confidence)
     if confidence < cfg.ok_confidence:
         return Health("low_confidence", f"confidence {confidence:.2f} is below {cfg.ok_confidence:g}", confidence)

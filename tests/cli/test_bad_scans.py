@@ -4,6 +4,9 @@ import json
 import numpy as np
 import pytest
 
+from delo_jax.data.fields import RawScan
+from delo_jax.data.sequence import Dataset
+
 
 def floats(points) -> bytes:
     """Bytes of a .bin file."""
@@ -68,6 +71,28 @@ def test_bad_scans_among_good_ones(scans, cli, tmp_path):
     assert done.out.count("rejected: ") == 5 + 1
     assert "more; frames.csv has them all" in done.out
     assert json.loads((tmp_path / "out" / "run.json").read_text())["frames"] == {"ok": len(BAD) + 2, "rejected": len(BAD) + 1}
+
+
+def test_times_that_are_none_among_good_ones(scans, cli, tmp_path, monkeypatch):
+    """Oracle: the order of the scans; times of the day instead of the sweep are a rejected frame, not the end of the drive."""
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for index in range(3):
+        write(folder / f"{index:06d}.bin", scans[0].read_bytes())
+    read = Dataset.__getitem__
+
+    def read_at_noon(self, index):
+        scan = read(self, index)
+        return RawScan(scan.points, np.full(len(scan.points), 43_200.0)) if index == 1 else scan
+
+    monkeypatch.setattr(Dataset, "__getitem__", read_at_noon)
+    done = cli("run", folder, "--out", tmp_path / "out", "--deskew", "auto")
+    assert done.code == 0
+    with (tmp_path / "out" / "frames.csv").open(newline="") as file:
+        frames = list(csv.DictReader(file))
+    assert [frame["status"] for frame in frames] == ["ok", "rejected", "ok"]
+    assert [frame["since_index"] for frame in frames] == ["0", "0", "0"]
+    assert frames[1]["reason"] == "times_s: expected seconds relative to the stamp, within 1 s, got 43200 s"
 
 
 def test_a_pcd_that_lies_about_its_size(scans, cli, tmp_path):

@@ -71,9 +71,13 @@ def test_simulate_rolling_shutter_and_refuses_to_overwrite(cli, tmp_path):
     done = cli("simulate", tmp_path, "--num-scans", "2", "--seed", "5", "--rolling-shutter")
     assert done.code == 0
     command = re.search(r"delo (run .*)", done.out)[1].split()
-    assert command == ["run", str(tmp_path), "--sequence", "mixed-5", "--deskew", "on"]
+    assert command == ["run", str(tmp_path), "--sequence", "mixed-5"]
     assert cli(*command, "--dump-config").code == 0
-    assert open_dataset(tmp_path, azimuth_times=True).compensated is False
+    dataset = open_dataset(tmp_path)
+    assert (dataset.compensated, dataset.point_times) == (False, "azimuth")
+    drive = next(iter(sim.simulate_drive("mixed", 5, 2, rolling_shutter=True)))
+    late_s = (dataset[0].times - drive.times_s + 0.05) % 0.1 - 0.05  # right behind, a sweep begins and ends
+    np.testing.assert_allclose(late_s, 0.0, atol=1e-3)  # a column of beams is wider than a line
     again = cli("simulate", tmp_path, "--num-scans", "2", "--seed", "5")
     assert (again.code, again.err.count("\n")) == (2, 1)
 
@@ -121,6 +125,7 @@ def test_train(cli, monkeypatch, tmp_path, weights_file):
     assert card["license"] == "MIT"
     assert card["metrics"][0]["lost_share"] == 0.025
     assert card["commands"] == [f"delo train base --out {tmp_path}"]
+    assert card["seeds"] == {"base": 0, "validation": "worlds from seed 1000000 on, never trained on"}
     weights.load(tmp_path / "delo-base.safetensors")
 
 
@@ -131,6 +136,8 @@ def test_train_interrupted_says_how_to_go_on(cli, monkeypatch, tmp_path):
         raise KeyboardInterrupt
 
     monkeypatch.setitem(sys.modules, "delo_jax.train.loop", SimpleNamespace(train=interrupt))
-    done = cli("train", "base", "--out", tmp_path)
-    assert done.code == 1
-    assert done.err.strip().endswith(f"to go on: delo train base --out {tmp_path}")
+    monkeypatch.chdir(tmp_path)
+    for options in ("", f" --out {tmp_path}"):
+        done = cli("train", "base", *options.split())
+        assert done.code == 1
+        assert done.err.strip().endswith(f"to go on: delo train base{options}")

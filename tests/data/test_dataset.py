@@ -66,13 +66,37 @@ def test_elevation_and_azimuth_switches(tmp_path):
     np.testing.assert_array_equal(np.sign(dataset[0].times), -np.sign(POINTS[:, 1]))
 
 
+def test_scans_that_say_to_be_as_measured_get_times_by_themselves(tmp_path):
+    """Oracle: the azimuth of each point in sweeps of 0.1 s, the spacing of the stamps."""
+    folder = odometry_tree(tmp_path)
+    (folder / "calib.txt").write_text(CALIB + "motion_compensated: 0\n")
+    dataset = open_dataset(folder)
+    assert (dataset.compensated, dataset.point_times) == (False, "azimuth")
+    np.testing.assert_allclose(dataset[0].times, -0.1 * np.arctan2(POINTS[:, 1], POINTS[:, 0]) / (2 * np.pi), atol=1e-7)
+
+
+def test_rows_of_a_tree_have_four_columns(tmp_path):
+    """Oracle: the five columns that went in; a plain folder takes them."""
+    folder = odometry_tree(tmp_path)
+    rng = np.random.default_rng(0)
+    rows = np.column_stack([rng.normal(0, [10, 10, 1], (2000, 3)), rng.uniform(0, 255, 2000), np.arange(2000) % 32]).astype("<f4")
+    rows.tofile(folder / "velodyne/000000.bin")
+    with pytest.raises(ScanError, match="expected rows of 4 float32 values, got values that look like rows of 5"):
+        open_dataset(folder)[0]
+    (tmp_path / "plain").mkdir()
+    rows.tofile(tmp_path / "plain/0.bin")
+    np.testing.assert_array_equal(open_dataset(tmp_path / "plain")[0].points, rows[:, :3])
+
+
 def test_excerpts_with_the_times_and_poses_of_the_whole(tmp_path):
     """Oracle: the frame numbers in the names of the scans, and one that is missing."""
     dataset = open_dataset(odometry_tree(tmp_path, numbers=(56, 57, 59), rows=100))
     np.testing.assert_array_equal(dataset.stamps_ns, np.array([56, 57, 59]) * 100_000_000)
     np.testing.assert_allclose(dataset.truth[:, 0, 3], [0, 1, 3], atol=1e-12)
-    with pytest.raises(DatasetError, match=r"times.txt: expected one row for each of 3 scans, got 20"):
-        open_dataset(odometry_tree(tmp_path / "short", numbers=(56, 57, 59), rows=20))
+    dataset = open_dataset(odometry_tree(tmp_path / "short", numbers=(56, 57, 59), rows=20))
+    assert (dataset.stamps_ns, dataset.truth, dataset.truth_source) == (None, None, "none")
+    assert "times.txt not used: it has 20 rows for 3 scans" in dataset.notes[0]
+    assert "00.txt not used: it has 20 rows for 3 scans" in dataset.notes[1]
 
 
 def test_sequence_without_calibration_times_or_poses(tmp_path):
@@ -185,7 +209,41 @@ def test_folder_with_stored_times(tmp_path):
     np.savez(tmp_path / "1.npz", xyz=POINTS, time=np.linspace(3.0, 3.1, 40))
     dataset = open_dataset(tmp_path, azimuth_times=True)
     assert dataset.point_times == "stored"
-    np.testing.assert_allclose(dataset[1].times, np.linspace(-0.05, 0.05, 40), atol=1e-9)
+    np.testing.assert_allclose(dataset[1].times, np.linspace(-0.05, 0.05, 40), atol=1e-9)  # of a clock
+
+
+def folder_of_sweeps(folder, starts, *, last=0.1, spacing_s=None):
+    """Scans whose times go from each start to `last` after it."""
+    folder.mkdir()
+    for i, start in enumerate(starts):
+        np.savez(folder / f"{i}.npz", xyz=POINTS, time=start + np.linspace(0, last, 40))
+    if spacing_s:
+        (folder / "times.txt").write_text("".join(f"{spacing_s * i}\n" for i in range(len(starts))))
+    return open_dataset(folder)
+
+
+@pytest.mark.parametrize("count", [2, 3, 15])
+def test_times_of_a_recording_are_relative_to_mid_sweep(tmp_path, count):
+    """Oracle: closed form; those of the first second are as small as offsets, but do not start over."""
+    dataset = folder_of_sweeps(tmp_path / "clock", 0.1 * np.arange(count))
+    for scan in dataset:
+        np.testing.assert_allclose(scan.times, np.linspace(-0.05, 0.05, 40), atol=1e-9)
+
+
+def test_offsets_start_over_in_each_scan(tmp_path):
+    """Oracle: the times that were saved, which jitter around 0."""
+    starts = [1e-4, -1e-4, 0.0, 1e-5]
+    for start, scan in zip(starts, folder_of_sweeps(tmp_path / "offsets", starts), strict=True):
+        np.testing.assert_allclose(scan.times, start + np.linspace(0, 0.1, 40), atol=1e-12)
+
+
+@pytest.mark.parametrize(("spacing_s", "used"), [(0.1, False), (0.66, False), (0.68, True), (None, True)])
+def test_normalised_times_are_left_out(tmp_path, spacing_s, used):
+    """Oracle: closed form; from 0 to 1 they are no seconds where a scan follows in less than 1 s / 1.5."""
+    dataset = folder_of_sweeps(tmp_path / "normalised", [0, 0, 0], last=1.0, spacing_s=spacing_s)
+    assert dataset.point_times == ("stored" if used else "none")
+    assert (dataset[0].times is not None) is used
+    assert any("a sweep lasts 1 s" in note for note in dataset.notes) is not used
 
 
 @pytest.mark.data

@@ -18,7 +18,7 @@ FIELDS = [
 ]
 ROWS = [(7 * i, 0.5 * i, 1.5 * i - 40, 1, 2, 3, 20 - 0.25 * i, 1_000_000 * i) for i in range(101)]
 POINTS = np.array([[row[2], row[6], row[1]] for row in ROWS], np.float32)
-TIMES = np.linspace(-0.05, 0.05, 101)
+TIMES = np.linspace(0, 0.1, 101)
 
 
 def header(data, points=101, **changes):
@@ -80,6 +80,13 @@ def test_every_encoding(tmp_path, kind):
     np.testing.assert_allclose(scan.times, TIMES, atol=1e-12)
 
 
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+def test_an_end_of_less_than_a_point_is_passed_over(tmp_path, kind):
+    """Oracle: the rows that struct packed, or str printed, before a line break of some editor."""
+    (tmp_path / "0.pcd").write_bytes(files()[kind] + b"\n\n")
+    np.testing.assert_array_equal(read_scan(tmp_path / "0.pcd").points, POINTS)
+
+
 def test_lzf_back_references():
     """Oracle: a stream made by hand after liblzf's description: a literal run, a copy, a repetition that overlaps, a long one."""
     stream = bytes([4]) + b"abcde"  # 5 literals
@@ -100,8 +107,8 @@ def test_lzf_distance_of_two_bytes():
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (header("binary", POINTS=10**15) + packed_rows(), "cut short"),
-        (header("ascii", POINTS=10**15), "got"),
+        (header("binary", points=10**15) + packed_rows(), "cut short"),
+        (header("ascii", points=10**15), "cut short"),
         (header("binary", COUNT="1 1 1 999999999999 1 1") + packed_rows(), "cut short"),
         (header("ascii", COUNT="1 1 1 999999999999 1 1") + b"1 2 3", "cut short"),
         (header("binary", POINTS=0), "POINTS to be a positive integer"),
@@ -111,7 +118,11 @@ def test_lzf_distance_of_two_bytes():
         (header("binary", TYPE="U F F") + packed_rows(), "one length"),
         (header("binary", FIELDS="intensity z a _ y t") + packed_rows(), "fields x, y, z"),
         (header("zstd") + packed_rows(), "'zstd'"),
-        (header("ascii") + b"1 2 three " * 500, "numbers"),
+        (header("ascii") + b"1 2 three " * 270, "numbers"),
+        (header("binary", POINTS=100) + packed_rows(), r"WIDTH x HEIGHT \(101\), got 100"),
+        (header("binary", HEIGHT=2) + packed_rows(), r"WIDTH x HEIGHT \(202\), got 101"),
+        (header("binary", points=100) + packed_rows(), "expected 100 points, got 101"),
+        (header("ascii", points=1) + b"1 2 3 4 5 6 7 8\n" * 2, "expected 1 points, got 2"),
         (b"\x00" * 100, "DATA line"),
         (header("binary_compressed") + b"\x01", "cut short"),
         (compressed(b"\x00" * 10, 2**31), "decompression"),

@@ -38,7 +38,7 @@ def test_every_encoding(tmp_path, kind):
     scan = read_scan(tmp_path / "0.ply")
     np.testing.assert_array_equal(scan.points, POINTS)
     assert scan.points.dtype == np.dtype("=f4")
-    np.testing.assert_allclose(scan.times, np.linspace(-0.05, 0.05, 101), atol=1e-7)
+    np.testing.assert_allclose(scan.times, np.linspace(0, 0.1, 101), atol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -54,6 +54,30 @@ def test_bin_of_unlike_intensities(tmp_path, seed):
         np.testing.assert_array_equal(read_scan(tmp_path / "0.bin").points, points.astype(np.float32))
 
 
+@pytest.mark.parametrize("columns", [2, 7, 8, 9, 10, 11, 12])
+def test_bin_of_a_count_that_no_sensor_writes_is_refused(tmp_path, columns):
+    """Oracle: the count that went in, of columns with units of their own: unit normals, reflectance, ring, time, constants."""
+    points, rng = street(6000), np.random.default_rng(0)
+    normals = rng.normal(size=(6000, 3)) / 2
+    table = np.hstack([points, extra_columns(6000, 6), normals, rng.uniform(100, 200, (6000, 2)), np.full((6000, 1), 7.0)])
+    (tmp_path / "0.bin").write_bytes(table[:, :columns].astype("<f4").tobytes())
+    assert f"look like rows of {columns};" in message_of(tmp_path / "0.bin")
+
+
+@pytest.mark.parametrize("columns", [3, 5, 6])
+def test_bin_of_another_count_than_the_known_one(tmp_path, columns):
+    """Oracle: the count that went in; 12,000 points are whole rows of four as well."""
+    (tmp_path / "0.bin").write_bytes(np.hstack([street(12_000), extra_columns(12_000, columns)]).astype("<f4").tobytes())
+    with pytest.raises(ScanError, match=f"0.bin: expected rows of 4 float32 values, got values that look like rows of {columns};"):
+        read_scan(tmp_path / "0.bin", bin_columns=4)
+
+
+def test_bin_without_a_return(tmp_path):
+    """Oracle: the zeros that went in; they tell no count from another."""
+    (tmp_path / "0.bin").write_bytes(bytes(16 * 600))
+    np.testing.assert_array_equal(read_scan(tmp_path / "0.bin").points, np.zeros((600, 3)))
+
+
 def test_few_points_are_read_as_kitti_rows(tmp_path):
     """Oracle: struct."""
     (tmp_path / "0.bin").write_bytes(struct.pack("<12f", *range(12)))
@@ -121,7 +145,7 @@ def test_npy_arrays(tmp_path):
         np.testing.assert_array_equal(scan.points, points.astype(np.float32))
         assert scan.points.flags.c_contiguous
         assert scan.points.flags.writeable
-    np.testing.assert_allclose(scan.times, np.linspace(-0.05, 0.05, 50), atol=1e-8)  # nanoseconds, whole ones
+    np.testing.assert_allclose(scan.times, np.linspace(0, 0.1, 50), atol=1e-8)  # nanoseconds, whole ones
 
 
 def test_bad_npy(tmp_path):
@@ -153,6 +177,15 @@ def test_npz_keys(tmp_path, save):
         scan = read_scan(tmp_path / f"{name}.npz")
         np.testing.assert_array_equal(scan.points, points.astype(np.float32))
         np.testing.assert_allclose(scan.times, np.linspace(-0.05, 0.05, 50), atol=1e-12)
+
+
+def test_npz_with_a_stamp_beside_its_times(tmp_path):
+    """Oracle: the arrays that numpy saved; a single time is that of the scan, under whatever name."""
+    points, times = street(50), np.linspace(0, 0.1, 50)
+    np.savez(tmp_path / "stamp.npz", xyz=points, timestamp=np.float64(1.7e9))
+    np.savez(tmp_path / "both.npz", xyz=points, time=np.array([1.7e9]), offset_time=times)
+    assert read_scan(tmp_path / "stamp.npz").times is None
+    np.testing.assert_array_equal(read_scan(tmp_path / "both.npz").times, times)
 
 
 def test_bad_npz(tmp_path):

@@ -1,6 +1,7 @@
 import numpy as np
+import pytest
 
-from delo_jax.data.sequence import azimuth_times, correct_elevation
+from delo_jax.data.sequence import Dataset, azimuth_times, correct_elevation
 
 
 def test_elevation_is_raised_and_range_and_azimuth_kept():
@@ -33,3 +34,22 @@ def test_azimuth_times_of_a_clockwise_sweep():
     points = np.array([[-1, 1e-6, 0], [0, 3, 1], [5, 0, 0], [0, -2, 0], [-1, -1e-6, 0], [np.nan, 0, 0]], np.float32)
     expected = 0.1035 * np.array([-0.5, -0.25, 0.0, 0.25, 0.5, 0.0])
     np.testing.assert_allclose(azimuth_times(points), expected, atol=1e-6)
+    np.testing.assert_allclose(azimuth_times(points, sweep_s=0.05), expected * 0.05 / 0.1035, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("stamps_ms", "sweep_s"),
+    [
+        (None, 0.1035),
+        ([0], 0.1035),
+        ([0, 100, 200, 300], 0.1),
+        ([0, 50, 1000, 1050, 1100], 0.05),
+        ([0, 1000, 2000], 0.1035),
+        ([0, 10, 20], 0.1035),
+    ],
+    ids=["none", "one", "10 Hz", "20 Hz and a gap", "a scan a second", "packets"],
+)
+def test_a_sweep_lasts_as_long_as_scans_are_apart(stamps_ms, sweep_s):
+    """Oracle: closed form; KITTI's sweep where stamps are missing or too far from those of a turning sensor."""
+    stamps_ns = None if stamps_ms is None else np.array(stamps_ms) * 1_000_000
+    assert Dataset(name="", layout="", paths=(), stamps_ns=stamps_ns).sweep_s == pytest.approx(sweep_s)

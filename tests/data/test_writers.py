@@ -61,6 +61,24 @@ def test_tree_is_read_back_uncorrected(tmp_path):
     assert dataset.compensated is False
 
 
+@pytest.mark.parametrize("victim", ["write_bin", "format_kitti_pose", "format_seconds"])
+def test_a_killed_run_leaves_a_tree_that_is_read(tmp_path, monkeypatch, victim):
+    """Oracle: the scans before the one in which the process ends; nothing is cleaned up, the last rows may have no scan."""
+    writer = KittiTreeWriter(tmp_path, "00")
+    for i in range(3):
+        writer.append(np.ones((5, 3)) + i, np.eye(4))
+
+    def kill(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"delo_jax.data.writers.{victim}", kill)
+    with pytest.raises(KeyboardInterrupt):
+        writer.append(np.ones((5, 3)), np.eye(4))
+    dataset = open_dataset(tmp_path)
+    assert (len(dataset), len(dataset.stamps_ns), len(dataset.truth), dataset.notes) == (3, 3, 3, ())
+    writer.__exit__()
+
+
 def test_existing_sequence_and_unwritable_folder_are_refused(tmp_path):
     """Oracle: one sentence each; the first tree is left as it was."""
     with KittiTreeWriter(tmp_path, "00") as writer:

@@ -19,6 +19,11 @@ def see(T_world_lidar, landmarks=LANDMARKS):
     return (landmarks @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
 
 
+def noise(seed):
+    """A scan that shows nothing: as many points as there are landmarks, anywhere."""
+    return np.random.default_rng(seed).uniform(-30, 30, LANDMARKS.shape).astype(np.float32)
+
+
 def kabsch(source, target):
     """T_target_source in float64, by scipy's solution of Wahba's problem."""
     source, target = source.astype(np.float64), target.astype(np.float64)
@@ -30,20 +35,31 @@ def kabsch(source, target):
 
 
 class ExactNetwork:
-    """`prepare` and `align` for LidarOdometry; remembers what it was asked. Scans of too few points are rejected."""
+    """`prepare` and `align` for LidarOdometry; remembers what it was asked.
 
-    def __init__(self):
+    Scans of too few points are rejected, and those that no pose within reach brings within 2 m.
+    """
+
+    def __init__(self, reach_m=np.inf, *, copy=False):
         self.prepared, self.starts, self.pairs = [], [], []
+        self._reach_m, self._copy = reach_m, copy
 
     def prepare(self, params, points):
+        points = points.copy() if self._copy else points
         self.prepared.append(points)
         return EncodedScan(points, len(points))
+
+    def _fits(self, T, source, target):
+        apart = np.abs(source @ T[:3, :3].T + T[:3, 3] - target).max()
+        return apart < 2.0 and np.linalg.norm(T[:3, 3]) < self._reach_m
 
     def align(self, params, source, target, T_target_source_init):
         self.starts.append(T_target_source_init)
         self.pairs.append((source.encoding, target.encoding))
         bad = min(source.num_points, target.num_points) < params.cfg.status.min_points
         T = T_target_source_init if bad else kabsch(source.encoding, target.encoding)
+        if not bad and not self._fits(T, source.encoding, target.encoding):
+            bad, T = True, T_target_source_init
         variances = UNKNOWN if bad else SIGMA2
         return Estimate(
             T_target_source=T,
@@ -52,5 +68,5 @@ class ExactNetwork:
             epistemic=variances,
             status="rejected" if bad else "ok",
             confidence=0.0 if bad else 0.9,
-            reason="too few points" if bad else "",
+            reason="nothing to go by" if bad else "",
         )

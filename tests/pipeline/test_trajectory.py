@@ -21,7 +21,7 @@ FILES = ("poses_kitti.txt", "trajectory.tum", "frames.csv", "covariances.npy")
 EPOCH_NS = 1_317_384_506_123_456_789  # float64 seconds would lose its last digits
 
 
-def make_frame(index, *, status="ok", reason="", stamp_ns=None):
+def make_frame(index, *, status="ok", reason="", stamp_ns=None, since=None):
     """A frame on a winding track whose numbers all depend on its index."""
     T_world_lidar = np.eye(4)
     T_world_lidar[:3, :3] = Rotation.from_euler("xyz", [0.01 * index, -0.02, 0.1 * index]).as_matrix()
@@ -29,7 +29,8 @@ def make_frame(index, *, status="ok", reason="", stamp_ns=None):
     sigmas = np.deg2rad([0.1, 0.2, 0.3]).tolist() + [0.01, 0.02, 0.03]
     motion = SimpleNamespace(covariance=np.diag(np.square(sigmas)) * (index + 1), confidence=0.75, status=status, reason=reason)
     timing = {"prepare": 0.0125} if index == 0 else {"prepare": 0.0125, "solve": 0.0075}
-    return SimpleNamespace(T_world_lidar=T_world_lidar, motion=motion, status=status, stamp_ns=stamp_ns, timing=timing)
+    since = max(index - 1, 0) if since is None else since
+    return SimpleNamespace(T_world_lidar=T_world_lidar, motion=motion, since=since, status=status, stamp_ns=stamp_ns, timing=timing)
 
 
 @pytest.fixture
@@ -37,6 +38,7 @@ def frames():
     stamps = [EPOCH_NS + 103_000_001 * index for index in range(5)]
     frames = [make_frame(index, stamp_ns=stamp) for index, stamp in enumerate(stamps)]
     frames[3] = make_frame(3, status="rejected", reason='too few points: 12,\nexpected "100"', stamp_ns=stamps[3])
+    frames[4] = make_frame(4, stamp_ns=stamps[4], since=2)  # bridges the bad one
     return frames
 
 
@@ -75,6 +77,8 @@ def test_frame_table_has_units_and_one_line_per_frame(frames, tmp_path):
     assert len((tmp_path / "frames.csv").read_text().splitlines()) == 6
     with open(tmp_path / "frames.csv", newline="") as file:
         rows = list(csv.DictReader(file))
+    assert [row["index"] for row in rows] == list("01234")
+    assert [row["since_index"] for row in rows] == list("00122")
     assert [row["status"] for row in rows] == ["ok", "ok", "ok", "rejected", "ok"]
     assert rows[3]["reason"] == 'too few points: 12, expected "100"'
     assert float(rows[0]["sigma_ry_deg"]) == pytest.approx(0.2)

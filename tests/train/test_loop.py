@@ -1,6 +1,7 @@
 """The training run: phases, checkpoints, resumption. The network's own step has its tests; here an exact one stands in."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from delo_jax.train import loop
 from delo_jax.train.step import TrainState
 from tests.fixtures import TINY_TRAINING, street_world, tiny_model
 
-CFG = dataclasses.replace(TINY_TRAINING, num_steps=5, num_evidence_steps=4, validate_every=2, num_frames=3, batch_size=1)
+CFG = dataclasses.replace(TINY_TRAINING, num_steps=11, num_evidence_steps=10, validate_every=4, num_frames=3, batch_size=1)
 
 
 class Reporter:
@@ -71,27 +72,80 @@ def as_bytes(model):
 
 
 def test_run_goes_through_its_pieces(tmp_path):
-    """Oracle: the config, by hand: two phases; validation and checkpoint every second step and at the end of a phase."""
+    """Oracle: the config, by hand: two phases; validation and checkpoint every fourth step and at the end of a phase."""
     reporter = Reporter()
     model, errors = loop.train(CFG, tmp_path, reporter)
     assert (model.cfg, errors) == (CFG.model, [])
     assert reporter.pieces == [
         ("simulating training worlds", 2, 0),
         ("simulating validation worlds", 1, 0),
-        ("learning poses", 5, 0),
-        ("learning evidence", 4, 0),
+        ("learning poses", 11, 0),
+        ("learning evidence", 10, 0),
     ]
-    assert len(reporter.notes) == 9
+    assert len(reporter.notes) == 21
     assert all(note.startswith("loss ") for note in reporter.notes)
-    assert reporter.validations == [2, 4, 5, 6, 8, 9]
+    assert reporter.validations == [4, 8, 11, 12, 16, 20, 21]
 
 
 def test_phases_switch_the_losses():
     """Oracle: by hand; first all but the evidence, then the evidence alone."""
     (pose, num_pose), (evidence, num_evidence) = loop.phases(CFG)
-    assert (num_pose, num_evidence) == (5, 4)
+    assert (num_pose, num_evidence) == (11, 10)
     assert (pose.coarse_weight, pose.fine_weight, pose.evidence_weight) == (CFG.coarse_weight, CFG.fine_weight, 0.0)
     assert (evidence.coarse_weight, evidence.fine_weight, evidence.evidence_weight) == (0.0, 0.0, CFG.evidence_weight)
+
+
+@pytest.mark.parametrize(
+    ("weights", "pieces", "num_steps"),
+    [
+        ({"fine_weight": 0.0}, [("learning poses", 11, 0), ("learning evidence", 10, 0)], 21),
+        ({"coarse_weight": 0.0}, [("learning poses", 11, 0), ("learning evidence", 10, 0)], 21),
+        ({"coarse_weight": 0.0, "fine_weight": 0.0}, [("learning evidence", 10, 0)], 10),
+        ({"evidence_weight": 0.0}, [("learning poses", 11, 0)], 11),
+        ({"coarse_weight": 0.0, "fine_weight": 0.0, "evidence_weight": 0.0}, [], 0),
+    ],
+)
+def test_phase_without_a_loss_is_left_out(tmp_path, weights, pieces, num_steps):
+    """Oracle: by hand; nothing is learned where every weight is 0."""
+    reporter = Reporter()
+    loop.train(dataclasses.replace(CFG, **weights), tmp_path, reporter)
+    assert reporter.pieces[2:] == pieces
+    assert len(reporter.notes) == num_steps
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_loss_that_is_no_number_stops_the_training(tmp_path, monkeypatch, value):
+    """Oracle: the sentence; of the state that went wrong nothing is stored, the next run goes on from the last good one."""
+    make_train_step = loop.make_train_step
+
+    def make_failing(cfg, tx):
+        train_step = make_train_step(cfg, tx)
+
+        def failing(state, batch):
+            number = int(state.step)
+            state, metrics = train_step(state, batch)
+            return state, {"loss": jnp.float32(value)} if number == 7 else metrics
+
+        return failing
+
+    reporter, second = Reporter(), Reporter()
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "make_train_step", make_failing)
+        with pytest.raises(ConfigError, match=f"step 8: expected a finite loss, got {value}; lower learning_rate"):
+            loop.train(CFG, tmp_path, reporter)
+    assert (len(reporter.notes), reporter.validations) == (7, [4])
+    loop.train(CFG, tmp_path, second)
+    assert second.pieces[2] == ("learning poses", 11, 4)
+
+
+def test_batch_that_does_not_divide_over_the_devices(tmp_path, monkeypatch):
+    """Oracle: the sentence, before anything is simulated or written."""
+    monkeypatch.setattr(jax, "make_mesh", lambda *_, **__: SimpleNamespace(size=2))
+    reporter = Reporter()
+    with pytest.raises(ConfigError, match="batch_size: expected a multiple of the 2 local devices, got 1"):
+        loop.train(CFG, tmp_path / "out", reporter)
+    assert reporter.pieces == []
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +162,14 @@ def uninterrupted(whole_run, folder):
 
 @pytest.mark.parametrize(
     ("stop_after", "error"),
-    [(1, KeyboardInterrupt), (4, KeyboardInterrupt), (5, KeyboardInterrupt), (8, KeyboardInterrupt), (4, RuntimeError), (8, RuntimeError)],
+    [
+        (1, KeyboardInterrupt),
+        (8, KeyboardInterrupt),
+        (11, KeyboardInterrupt),
+        (18, KeyboardInterrupt),
+        (8, RuntimeError),
+        (18, RuntimeError),
+    ],
 )
 def test_interrupted_run_ends_where_the_other_does(tmp_path, whole_run, stop_after, error):
     """Oracle: the run that nobody interrupted, byte by byte; Ctrl-C loses no step, a crash those since the last checkpoint."""
@@ -118,10 +179,10 @@ def test_interrupted_run_ends_where_the_other_does(tmp_path, whole_run, stop_aft
     found, _ = loop.train(CFG, tmp_path, second)
     assert as_bytes(found) == uninterrupted(whole_run, tmp_path)
     if error is KeyboardInterrupt:
-        assert len(second.notes) == 9 - stop_after
+        assert len(second.notes) == 21 - stop_after
     else:  # a step is reported before its checkpoint is written
-        last = max(step for step in (0, 2, 4, 5, 6, 8) if step < stop_after)
-        assert len(second.notes) == 9 - last
+        last = max(step for step in (0, 4, 8, 11, 12, 16, 20) if step < stop_after)
+        assert len(second.notes) == 21 - last
 
 
 @pytest.mark.parametrize("moment", ["within a step", "after a step"])
@@ -139,9 +200,9 @@ def test_ctrl_c_at_the_worst_moment(tmp_path, whole_run, monkeypatch, moment):
         def interrupted(state, batch):
             number = int(state.step)
             state, metrics = train_step(state, batch)
-            if number == 3 and moment == "within a step":
+            if number == 5 and moment == "within a step":
                 raise KeyboardInterrupt
-            return state, {"loss": Loss()} if number == 3 else metrics
+            return state, {"loss": Loss()} if number == 5 else metrics
 
         return interrupted
 
@@ -151,7 +212,7 @@ def test_ctrl_c_at_the_worst_moment(tmp_path, whole_run, monkeypatch, moment):
             loop.train(CFG, tmp_path, Reporter())
     second = Reporter()
     assert as_bytes(loop.train(CFG, tmp_path, second)[0]) == uninterrupted(whole_run, tmp_path)
-    assert second.pieces[2] == ("learning poses", 5, 2 if moment == "within a step" else 4)
+    assert second.pieces[2] == ("learning poses", 11, 4 if moment == "within a step" else 6)
 
 
 def test_finished_run_is_only_read(tmp_path):
@@ -161,7 +222,7 @@ def test_finished_run_is_only_read(tmp_path):
     again, _ = loop.train(CFG, tmp_path, reporter)
     assert as_bytes(again) == as_bytes(first)
     assert reporter.notes == []
-    assert reporter.pieces[-2:] == [("learning poses", 5, 5), ("learning evidence", 4, 4)]
+    assert reporter.pieces[-2:] == [("learning poses", 11, 11), ("learning evidence", 10, 10)]
 
 
 def test_checkpoints_of_another_config_are_refused(tmp_path):
@@ -178,7 +239,7 @@ def test_phase_without_steps_is_left_out(tmp_path):
     reporter = Reporter()
     loop.train(cfg, tmp_path, reporter)
     assert [what for what, _, _ in reporter.pieces][2:] == ["learning poses"]
-    assert len(reporter.notes) == 5
+    assert len(reporter.notes) == 11
 
 
 def test_seed_decides_the_run(tmp_path):
@@ -191,7 +252,7 @@ def test_seed_decides_the_run(tmp_path):
 def test_the_real_thing_runs_from_end_to_end(tmp_path, monkeypatch):
     """Oracle: finite errors at every gap of the worlds, on the network itself."""
     monkeypatch.undo()
-    cfg = dataclasses.replace(CFG, num_scenes=1, num_steps=3, num_evidence_steps=2, num_frames=2)
+    cfg = dataclasses.replace(CFG, num_scenes=1, num_steps=10, num_evidence_steps=10, validate_every=10, num_frames=2)
     monkeypatch.setattr(loop, "worlds", lambda cfg, folder, **_: iter([street_world(cfg.model.preprocess, cfg.num_frames)]))
     model, errors = loop.train(cfg, tmp_path, Reporter())
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model))

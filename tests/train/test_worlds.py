@@ -62,6 +62,23 @@ def test_kinds_take_turns_and_validation_is_apart(simulator, tmp_path):
     assert min(seed for _, seed, _ in simulator) >= module.VALIDATION_SEED
 
 
+def test_runs_of_different_seeds_share_no_world(simulator, tmp_path):
+    """Oracle: the calls of the simulator, over three seeds, training and validation."""
+    for seed in range(3):
+        for validation in (False, True):
+            list(worlds(dataclasses.replace(CFG, seed=seed), tmp_path, validation=validation))
+    seeds = [seed for _, seed, _ in simulator]
+    assert len(seeds) == len(set(seeds)) == 3 * (7 + 2)
+
+
+def test_worlds_of_another_simulator_are_made_anew(simulator, tmp_path, monkeypatch):
+    """Oracle: the calls of the simulator."""
+    list(worlds(CFG, tmp_path, validation=False))
+    monkeypatch.setattr(module, "SIMULATOR", module.SIMULATOR + 1)
+    list(worlds(CFG, tmp_path, validation=False))
+    assert len(simulator) == 2 * 7
+
+
 def test_interrupted_run_goes_on(simulator, tmp_path):
     """Oracle: the calls of the simulator; what was written stays, half a file does not count."""
     whole = list(worlds(CFG, tmp_path, validation=False))
@@ -87,7 +104,7 @@ def test_worlds_of_another_making_are_not_mixed_up(simulator, tmp_path, changed)
     """Oracle: the calls of the simulator; other frames, seed or preprocessing are made anew, another learning rate is not."""
     list(worlds(CFG, tmp_path, validation=False))
     simulator.clear()
-    list(worlds(dataclasses.replace(CFG, learning_rate=1e-5, num_steps=1), tmp_path, validation=False))
+    list(worlds(dataclasses.replace(CFG, learning_rate=1e-5, num_steps=20), tmp_path, validation=False))
     assert len(simulator) == 0
     list(worlds(dataclasses.replace(CFG, **changed), tmp_path, validation=False))
     assert len(simulator) == 7

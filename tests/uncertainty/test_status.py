@@ -4,17 +4,18 @@ import numpy as np
 import pytest
 
 from delo_jax.config import StatusConfig
+from delo_jax.uncertainty.observability import Observability, observability
 from delo_jax.uncertainty.status import STATUSES, judge
+from tests.uncertainty.planes import CORRIDOR, FIELD, ROOM, information
 
 CFG = StatusConfig(min_points=100, ok_confidence=0.5, rejected_confidence=0.05, min_observability=1e-3)
 GOOD = {
     "num_points": (100, 100),
     "finite": True,
     "confidence": 0.5,
-    "observability": np.array([1e-3, 0.4, 0.599]),
-    "weakest_axis": np.array([0.0, 1.0, 0.0]),
+    "seen": Observability(np.array([1e-3, 0.1, 0.2, 0.3, 0.4, 0.5]), np.eye(6)[::-1]),
 }
-SLIPPERY = np.array([5e-4, 0.4, 0.6])
+SLIPPERY = Observability(np.array([5e-4, 0.1, 0.2, 0.3, 0.4, 0.5]), np.eye(6)[[4, 0, 1, 2, 3, 5]])
 
 
 @pytest.mark.parametrize(
@@ -30,7 +31,7 @@ SLIPPERY = np.array([5e-4, 0.4, 0.6])
         ({"num_points": (3000, 0)}, "rejected", "target has 0 usable points, fewer than 100", 0.0),
         ({"num_points": (90, 50)}, "rejected", "target has 50 usable points, fewer than 100", 0.0),
         ({"num_points": (50, 90)}, "rejected", "source has 50 usable points, fewer than 100", 0.0),
-        ({"observability": SLIPPERY}, "degenerate", "hardly any surface holds the lateral direction (0.0005)", 0.5),
+        ({"seen": SLIPPERY}, "degenerate", "hardly any surface holds lateral (0.00050 is below 0.001)", 0.5),
     ],
 )
 def test_each_status_has_its_reason(changed, status, reason, confidence):
@@ -41,22 +42,22 @@ def test_each_status_has_its_reason(changed, status, reason, confidence):
 
 
 @pytest.mark.parametrize(
-    ("axis", "name"),
-    [([1, 0, 0], "forward"), ([-0.9, 0.3, 0.3], "forward"), ([0.1, -0.9, 0.2], "lateral"), ([0, 0.2, -0.9], "vertical")],
+    ("scene", "status", "axes"), [(FIELD, "degenerate", "yaw, forward, lateral"), (CORRIDOR, "degenerate", "forward"), (ROOM, "ok", "")]
 )
-def test_weakest_direction_is_named(axis, name):
-    """Oracle: the frame of the sensor, x forward, y left, z up; a direction has no sign."""
-    health = judge(**(GOOD | {"observability": SLIPPERY, "weakest_axis": np.array(axis)}), cfg=CFG)
-    assert f"holds the {name} direction" in health.reason
+def test_reason_names_every_unheld_axis(scene, status, axes):
+    """Oracle: geometry, in the frame of the sensor: x forward, y left, z up."""
+    health = judge(**(GOOD | {"seen": observability(information(scene))}), cfg=CFG)
+    assert health.status == status
+    assert health.reason == (f"hardly any surface holds {axes} (0.00000 is below 0.001)" if axes else "")
 
 
 @pytest.mark.parametrize(
     ("changed", "status"),
     [
-        ({"num_points": (0, 0), "finite": False, "confidence": 0.0, "observability": SLIPPERY}, "rejected"),
-        ({"finite": False, "observability": np.full(3, np.nan), "confidence": 1.0}, "rejected"),
-        ({"confidence": 0.01, "observability": SLIPPERY}, "rejected"),
-        ({"confidence": 0.3, "observability": SLIPPERY}, "degenerate"),
+        ({"num_points": (0, 0), "finite": False, "confidence": 0.0, "seen": SLIPPERY}, "rejected"),
+        ({"finite": False, "seen": observability(np.zeros((6, 6))), "confidence": 1.0}, "rejected"),
+        ({"confidence": 0.01, "seen": SLIPPERY}, "rejected"),
+        ({"confidence": 0.3, "seen": SLIPPERY}, "degenerate"),
     ],
 )
 def test_the_worst_status_wins(changed, status):
