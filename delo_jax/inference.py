@@ -45,12 +45,11 @@ class Estimate:
     @classmethod
     def exact(cls, T_target_source: np.ndarray) -> "Estimate":
         """A pose that is known without error."""
-        none = np.zeros(6)
         return cls(
             T_target_source=T_target_source,
             covariance=np.zeros((6, 6)),
-            aleatoric=none,
-            epistemic=none,
+            aleatoric=np.zeros(6),
+            epistemic=np.zeros(6),
             status="ok",
             confidence=1.0,
             reason="",

@@ -1,14 +1,19 @@
 """A network that is never wrong: scans that carry their own correspondences, aligned in closed form."""
 
 import numpy as np
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from delo_jax.config import DeloConfig, StatusConfig
 from delo_jax.inference import EncodedScan, Estimate
 from delo_jax.model.delo import Model
+from delo_jax.pipeline.lidar_odometry import LidarOdometry
+from tests.oracles.registration import hat
 
 PARAMS = Model({}, DeloConfig(status=StatusConfig(min_points=20)))
 SIGMA2 = np.array([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 3e-4])  # variances of every estimate, order [omega, v]
+TWIST = np.array([0.02, -0.04, 0.3, 9.0, 0.4, -0.1])  # body velocity per second
+FEW = np.ones((3, 3), np.float32)
 LANDMARKS = np.random.default_rng(7).uniform([-30, -30, -2], [30, 30, 8], size=(60, 3))
 UNKNOWN = np.repeat([np.radians(30.0) ** 2, 25.0], 3)  # variances of a pose nobody measured, by default
 
@@ -70,3 +75,23 @@ class ExactNetwork:
             confidence=0.0 if bad else 0.9,
             reason="nothing to go by" if bad else "",
         )
+
+
+def make(network=None, **options):
+    """An odometry and its network."""
+    network = ExactNetwork() if network is None else network
+    return LidarOdometry(PARAMS, prepare=network.prepare, align=network.align, **options), network
+
+
+def winding_road(num):
+    """Poses whose rotations do not commute; the first is the identity."""
+    steps = [expm(hat([0.05 * np.sin(k), 0.04, 0.3 * np.cos(k), 1.0 + 0.2 * k, 0.3 * np.sin(2 * k), 0.1])) for k in range(num - 1)]
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    return poses
+
+
+def screw(seconds):
+    """Pose at a time of the drive at constant velocity."""
+    return expm(hat(np.asarray(TWIST) * seconds))
