@@ -13,6 +13,7 @@ from delo_jax.errors import ScanError
 BIN_COLUMNS = (4, 5, 3, 6)  # in order of preference
 _COUNTS = range(2, 13)  # those told apart
 _BLOCK = 60  # rows, or values where there are no rows yet
+_SAMPLE = 8_000  # values looked at; a whole scan would cost more than reading it
 # Two columns are no worse than four for a table of two, and 0.9 or more worse for a true four. Interleaved rings make x y z x y z
 # unlike too, and x y z i x y z i: by up to 0.5 on an HDL-32; true columns differ by 1.1 and more.
 _HANDICAPS = {columns: -0.3 if columns == 2 else 0.0 if columns < 6 else 0.8 for columns in _COUNTS}
@@ -94,14 +95,14 @@ def _likely_columns(values):
     """Column counts whose score is within the noise of the best, in order; all where there is nothing to tell them by."""
     if len(values) < _BLOCK or not (np.abs(values) > _NEAREST).any():
         return list(_COUNTS)
-    every = max(1, len(values) // 60_000)
+    every = max(1, len(values) // _SAMPLE)
     scores = {}
     for columns in _COUNTS:
-        rows = values[: len(values) // columns * columns].reshape(-1, columns)
-        rows = rows[np.arange(len(rows)) // _BLOCK % every == 0]  # rows in a block take every phase of a wrong count
-        sample = np.clip(np.nan_to_num(rows, nan=0.0), -_FARTHEST, _FARTHEST)
+        block = min(_BLOCK, len(values) // columns) * columns  # rows in a block take every phase of a wrong count
+        blocks = values[: len(values) // block * block].reshape(-1, block)[::every]
+        sample = np.clip(np.nan_to_num(blocks.reshape(-1, columns), nan=0.0), -_FARTHEST, _FARTHEST)
         scores[columns] = float(np.mean(np.log(sample.var(axis=0, dtype=np.float64) + 1e-6))) + _HANDICAPS[columns]
-    noise = max(0.1, 8.0 / np.sqrt(min(len(values), 60_000)))  # of a log variance over that many rows of four
+    noise = max(0.1, 8.0 / np.sqrt(min(len(values), _SAMPLE)))  # of a log variance over that many rows of four
     limit = min(scores.values()) + noise
     return [columns for columns in _COUNTS if scores[columns] <= limit]
 

@@ -91,7 +91,8 @@ def test_doctor(bound_cm, state, cli, monkeypatch):
     states = {
         row[1].strip(): row[3].strip() for row in (line.split("│") for line in done.out.splitlines()) if len(row) == 6 and row[3].strip()
     }
-    assert states.pop("self-test: a") == state  # the name goes on in the next line
+    self_test = next(name for name in states if name.startswith("self-test"))  # a narrow table breaks the rest of the name off
+    assert states.pop(self_test) == state
     if not weights.released():
         assert states.pop("released weights") == "problem"
     assert set(states.values()) == {"ok"}
