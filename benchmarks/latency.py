@@ -15,6 +15,8 @@ from typing import Any
 
 import jax
 import numpy as np
+from rich.console import Console
+from rich.progress import track
 
 import delo_jax
 from delo_jax import inference
@@ -42,7 +44,7 @@ def measure(params, scans: list[np.ndarray], num_scans: int) -> dict[str, list[f
     """Milliseconds per stage and scan; the older scan of each pair is encoded already, as in a stream."""
     times: dict[str, list[float]] = {"preprocess": [], "encode": [], "align": [], "total": []}
     source = inference.prepare(params, scans[0])
-    for k in range(WARM_UP + num_scans):
+    for k in track(range(WARM_UP + num_scans), "scans", console=Console(stderr=True)):
         scan, preprocess_ms = timed(preprocess, scans[(k + 1) % len(scans)], params.cfg.preprocess)
         encoding, encode_ms = timed(inference.encode, params, scan)
         target = inference.EncodedScan(encoding, int(scan.mask.sum()))
