@@ -12,6 +12,7 @@ from delo_jax.errors import ConfigError
 
 T = TypeVar("T")
 
+LEVER_M = 15.0  # a rotation moves the scene by about this arm; makes rotations and translations comparable
 NUM_FEATURES = 8  # numbers per point that `preprocess` computes and the network reads
 
 

@@ -35,8 +35,14 @@ class RateColumn(ProgressColumn):
 
 
 def progress(unit: str = "scans") -> Progress:
-    """A bar with count, rate and time left; on stderr, so that stdout holds results alone."""
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), RateColumn(unit), TimeRemainingColumn()
+    """A bar with count, rate and time left, or time taken once it is done; on stderr, so that stdout holds results alone."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        RateColumn(unit),
+        TimeRemainingColumn(elapsed_when_finished=True),
+    )
     note = TextColumn("{task.fields[note]}")
     return Progress(*columns, note, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty())  # a table in a file stays there
 

@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from delo_jax.config import LEVER_M
 from delo_jax.geometry import se3
 from delo_jax.geometry.se3 import AnyArray
 from delo_jax.model import fine
 
-LEVER_M = 15.0  # a rotation moves the scene by about this arm; makes rotations and translations comparable
 # Mean and standard deviation of each statistic over simulated pairs, a seventh of them lost; they only condition the
 # head's first layer, so two digits do.
 _TABLE = (

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-LEVER_M = 15.0  # arm by which rotations and translations are made comparable
+from delo_jax.config import LEVER_M
+
 AXES = ("roll", "pitch", "yaw", "forward", "lateral", "vertical")
 
 

@@ -30,10 +30,9 @@ def imu(seconds):
     return pose(Rotation.from_euler("xyz", [0.01, 0.02 * np.sin(seconds), yaw]).as_matrix(), [east, north, 116.0 + 0.1 * seconds])
 
 
-def packet(seconds, first):
-    """The line of an OXTS file: the inverse of the Mercator plane by the isometric latitude, lat = asin(tanh(q))."""
+def packet(T, first):
+    """The line of an OXTS file for T_world_imu: the inverse of the Mercator plane by the isometric latitude, lat = asin(tanh(q))."""
     scale = EARTH * np.cos(LATITUDE)
-    T = imu(seconds)
     east, north = (T - first)[:2, 3]
     latitude = np.arcsin(np.tanh(np.arctanh(np.sin(LATITUDE)) + north / scale))
     roll, pitch, yaw = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
@@ -63,7 +62,7 @@ def raw_drive(root, *, number=1, num_frames=40, missing=(), offset=0.0):
     write_timestamps(drive / "velodyne_points/timestamps.txt", scan_times)
     write_timestamps(drive / "oxts/timestamps.txt", packet_times)
     for i, seconds in enumerate(packet_times):
-        (drive / f"oxts/data/{i:010d}.txt").write_text(packet(seconds, imu(packet_times[0])))
+        (drive / f"oxts/data/{i:010d}.txt").write_text(packet(imu(seconds), imu(packet_times[0])))
     kept = [i for i in range(num_frames) if i not in missing]
     for i in kept:
         np.column_stack([POINTS, POINTS[:, 0]]).tofile(drive / f"velodyne_points/data/{i:010d}.bin")
