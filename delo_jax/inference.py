@@ -24,7 +24,7 @@ class Estimate:
     """Pose of a pair with its uncertainty and health.
 
     Variances and the covariance are those of `T_target_source` under a right perturbation, order [omega, v], rad and m.
-    They are the evidence head's own, not calibrated.
+    They are the evidence head's own, not calibrated; a preset without one says that it knows nothing.
     """
 
     T_target_source: np.ndarray
@@ -38,7 +38,7 @@ class Estimate:
     status: str
     """ok, low_confidence, degenerate or rejected."""
     confidence: float
-    """Probability in [0, 1] that the pair is not lost."""
+    """Probability in [0, 1] that the pair is not lost; with the paper's evidence head its 1 - Var[mu], which is none."""
     reason: str
     """Why the status is not ok; empty when it is."""
 
@@ -90,18 +90,22 @@ def align(params: delo.Model, source: EncodedScan, target: EncodedScan, T_target
     start = np.asarray(T_target_source_init, np.float64)
     result = jax.device_get(solve(params, source.encoding, target.encoding, jnp.asarray(start, jnp.float32)))
     seen = observability(result.information) if result.finite else observability(np.zeros((6, 6)))
+    head = params.cfg.evidence.head
     health = status.judge(
         num_points=(source.num_points, target.num_points),
         finite=bool(result.finite),
-        confidence=float(np.nan_to_num(result.confidence)),
+        confidence=None if head == "none" else float(np.nan_to_num(result.confidence)),
         seen=seen,
         cfg=limits,
     )
-    if health.status == "rejected":
-        T, known = start, covariance.unknown(limits)
-    else:
+    T, known = start, covariance.unknown(limits)
+    if health.status != "rejected":
         nig = [np.asarray(value, np.float64) for value in result.nig]
-        T, known = se3.exp(se3.log(np.asarray(result.T_target_source, np.float64))), covariance.from_evidence(*nig)
+        T = se3.exp(se3.log(np.asarray(result.T_target_source, np.float64)))
+        if head == "statistics":
+            known = covariance.from_evidence(*nig)
+        elif head == "embedding":
+            known = covariance.from_pose6_evidence(T, *nig)
     if health.status == "degenerate":
         known = covariance.widen(known, seen, limits)
     return Estimate(

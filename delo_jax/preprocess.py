@@ -16,11 +16,14 @@ HORIZONTAL = 0.85  # |n_z| above which a surface counts as ground-like
 
 
 class Scan(NamedTuple):
-    """One padded scan. Rows are in random order, so that the first N are an even subset; invalid rows come last."""
+    """One padded scan. Rows are in random order, so that the first N are an even subset; invalid rows come last.
+
+    With raw sampling there are neither normals nor features (no rows), and every point is a key point.
+    """
 
     points: Float[Array, "m 3"] | Float[np.ndarray, "m 3"]  # sensor frame [m]
-    normals: Float[Array, "m 3"] | Float[np.ndarray, "m 3"]  # unit, towards the sensor
-    features: Float[Array, "m f"] | Float[np.ndarray, "m f"]  # invariant to yaw
+    normals: Float[Array, "s 3"] | Float[np.ndarray, "s 3"]  # unit, towards the sensor; s = m or 0
+    features: Float[Array, "s f"] | Float[np.ndarray, "s f"]  # invariant to yaw
     mask: Bool[Array, " m"] | Bool[np.ndarray, " m"]  # True: a real point
     keypoint_index: Int[Array, " k"] | Int[np.ndarray, " k"]  # rows of `points`
     keypoint_mask: Bool[Array, " k"] | Bool[np.ndarray, " k"]
@@ -58,8 +61,10 @@ def preprocess(points: np.ndarray, cfg: PreprocessConfig) -> Scan:
     Raises:
         ScanError: wrong shape or dtype.
     """
-    cloud = voxel_mean(_crop(check_points(points), cfg), cfg.voxel_m)
-    rng = np.random.default_rng(0)  # the same scan gives the same bytes
+    points, rng = check_points(points), np.random.default_rng(0)  # the same scan gives the same bytes
+    if cfg.sampling == "raw":
+        return _raw_scan(points, cfg, rng)
+    cloud = voxel_mean(_crop(points, cfg), cfg.voxel_m)
     rows = one_per_voxel(cloud, cfg.point_voxel_m, rng) if len(cloud) else np.zeros(0, np.int64)
     centers, normals, features, valid = _describe(cloud, rows, cfg)
     kept = _select(normals, valid, cfg, rng)
@@ -73,6 +78,16 @@ def preprocess(points: np.ndarray, cfg: PreprocessConfig) -> Scan:
         _pad(keypoints.astype(np.int32), cfg.num_keypoints),
         _pad(np.ones(len(keypoints), bool), cfg.num_keypoints),
     )
+
+
+def _raw_scan(points: np.ndarray, cfg: PreprocessConfig, rng: np.random.Generator) -> Scan:
+    """Evenly spaced rows of the sweep as they are, in random order, every one a key point (Ali et al. 2023, Sec. 4)."""
+    points = points[np.isfinite(points).all(axis=1)]
+    num = min(len(points), cfg.max_points)
+    kept = rng.permutation(np.linspace(0, len(points), num, endpoint=False).astype(np.int64))
+    mask = _pad(np.ones(num, bool), cfg.max_points)
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, NUM_FEATURES), np.float32)
+    return Scan(_pad(points[kept], cfg.max_points), *nothing, mask, np.arange(cfg.max_points, dtype=np.int32), mask)
 
 
 def _crop(points: np.ndarray, cfg: PreprocessConfig) -> np.ndarray:

@@ -97,6 +97,32 @@ def progress() -> Progress:
     return Progress(*columns, console=Console(file=sys.stderr))
 
 
+class BarReporter:
+    """Progress of a training as bars; validations are kept, in a file too, so that a run that goes on has its whole curve."""
+
+    def __init__(self, bar: Progress, name: str = "", curve: Path | None = None):
+        self._bar, self._name, self._curve = bar, name, curve
+        self._task: Any = None
+        self.validations: dict[int, list[dict[str, float]]] = {}
+        if curve is not None and curve.exists():
+            self.validations = {int(step): rows for step, rows in json.loads(curve.read_text()).items()}
+
+    def start(self, what: str, total: int, done: int = 0) -> None:
+        """A new bar."""
+        self._task = self._bar.add_task(f"{self._name}: {what}" if self._name else what, total=total, completed=done)
+
+    def advance(self, note: str = "") -> None:
+        """One unit further."""
+        self._bar.advance(self._task)
+
+    def validated(self, step: int, errors: list) -> None:
+        """Errors on unseen worlds after `step` steps."""
+        self.validations[step] = [row._asdict() for row in errors]
+        if self._curve is not None:
+            self._curve.parent.mkdir(parents=True, exist_ok=True)
+            self._curve.write_text(json.dumps(self.validations))
+
+
 def device() -> str:
     """Versions and devices of this run, in a line."""
     import jax

@@ -9,10 +9,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from delo_jax.config import (
-    CoarseConfig,
+    AttentionConfig,
     DeloConfig,
+    EncoderConfig,
     EvidenceConfig,
     FineConfig,
+    MatchingConfig,
+    PoseConfig,
     PreprocessConfig,
     StatusConfig,
     TrainConfig,
@@ -21,16 +24,19 @@ from delo_jax.config import (
     to_toml,
 )
 from delo_jax.errors import ConfigError
+from delo_jax.train.presets import PRESETS
 
-ALL = [PreprocessConfig, CoarseConfig, FineConfig, EvidenceConfig, StatusConfig, DeloConfig, TrainConfig]
+PARTS = [PreprocessConfig, EncoderConfig, AttentionConfig, MatchingConfig, PoseConfig, FineConfig, EvidenceConfig, StatusConfig]
+ALL = [*PARTS, DeloConfig, TrainConfig]
 CHANGED = TrainConfig(
-    model=DeloConfig(name="it's", coarse=CoarseConfig(mass=1.0), evidence=EvidenceConfig(rotation_scale_rad=1e-30)),
+    model=DeloConfig(name="it's", matching=MatchingConfig(mass=1.0), evidence=EvidenceConfig(rotation_scale_rad=1e-30)),
     seed=3,
     learning_rate=1e22,
 )
+RAW = {"preprocess": PreprocessConfig(sampling="raw", max_points=64, num_keypoints=64), "encoder": EncoderConfig(kind="dgcnn")}
 
 
-@pytest.mark.parametrize("config", [*(cls() for cls in ALL), CHANGED], ids=lambda config: type(config).__name__)
+@pytest.mark.parametrize("config", [*(cls() for cls in ALL), CHANGED, *PRESETS.values()], ids=lambda config: type(config).__name__)
 def test_toml_says_what_the_config_holds(config, tmp_path):
     """Oracle: tomllib against dataclasses.asdict; `load` then gives an equal config."""
     text = to_toml(config)
@@ -48,17 +54,18 @@ def test_any_name_survives(name):
 
 def test_missing_keys_keep_their_defaults(tmp_path):
     """Oracle: dataclasses.replace."""
-    (tmp_path / "config.toml").write_text("seed = 7\n[model.coarse]\nmass = 1\n")
-    expected = dataclasses.replace(TrainConfig(), seed=7, model=DeloConfig(coarse=CoarseConfig(mass=1.0)))
+    (tmp_path / "config.toml").write_text("seed = 7\n[model.matching]\nmass = 1\n")
+    expected = dataclasses.replace(TrainConfig(), seed=7, model=DeloConfig(matching=MatchingConfig(mass=1.0)))
     found = load(TrainConfig, tmp_path / "config.toml")
     assert found == expected
-    assert type(found.model.coarse.mass) is float
+    assert type(found.model.matching.mass) is float
 
 
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({"coarse": {"mas": 0.3}}, r"config\.coarse: expected one of num_neighbors, .*, got 'mas'; did you mean 'mass'\?"),
+        ({"matching": {"mas": 0.3}}, r"config\.matching: expected one of plan, .*, got 'mas'; did you mean 'mass'\?"),
+        ({"coarse": {"mass": 0.3}}, r"config: expected one of name, .*, got 'coarse'"),
         ({"preproces": {}}, r"config: expected one of name, .*, got 'preproces'; did you mean 'preprocess'\?"),
         ({"fine": {"zzz": 1}}, r"config\.fine: expected one of [^;]*, got 'zzz'$"),
     ],
@@ -102,22 +109,43 @@ def test_wrong_type_is_refused(table, message):
         (PreprocessConfig, {"ground_share": 0.0}),
         (PreprocessConfig, {"num_keypoints": 0}),
         (PreprocessConfig, {"num_keypoints": 4000}),
-        (CoarseConfig, {"mass": 0.0}),
-        (CoarseConfig, {"mass": 1.01}),
-        (CoarseConfig, {"num_iters": 0}),
-        (CoarseConfig, {"num_neighbors": 0}),
-        (CoarseConfig, {"edge_scale_m": 0.0}),
-        (CoarseConfig, {"width": 0}),
-        (CoarseConfig, {"embedding_dim": 0}),
-        (CoarseConfig, {"consistency_m": float("nan")}),
+        (PreprocessConfig, {"sampling": "even"}),
+        (PreprocessConfig, {"sampling": "raw"}),  # 384 key points of 3072 points
+        (EncoderConfig, {"kind": "pointnet"}),
+        (EncoderConfig, {"edges": "both"}),
+        (EncoderConfig, {"num_neighbors": 0}),
+        (EncoderConfig, {"edge_scale_m": 0.0}),
+        (EncoderConfig, {"position_scale_m": float("nan")}),
+        (EncoderConfig, {"width": 0}),
+        (EncoderConfig, {"embedding_dim": 0}),
+        (AttentionConfig, {"num_heads": -1}),
+        (AttentionConfig, {"hidden": 0}),
+        (MatchingConfig, {"plan": "sinkhorn"}),
+        (MatchingConfig, {"scores": "angle"}),
+        (MatchingConfig, {"mass": 0.0}),
+        (MatchingConfig, {"mass": 1.01}),
+        (MatchingConfig, {"num_iters": 0}),
+        (MatchingConfig, {"epsilon": 0.0}),
+        (MatchingConfig, {"epsilon": 0.01, "learn_epsilon": True}),
+        (MatchingConfig, {"num_candidates": 0}),
+        (MatchingConfig, {"marginal_weight": -1.0}),
+        (PoseConfig, {"solver": "ransac"}),
+        (PoseConfig, {"consistency_m": float("nan")}),
+        (PoseConfig, {"num_rounds": 0}),
         (FineConfig, {"num_points": 15}),
         (FineConfig, {"num_iters": 1}),
+        (EvidenceConfig, {"head": "mlp"}),
+        (EvidenceConfig, {"embedding": "decoder"}),
         (EvidenceConfig, {"width": 0}),
         (EvidenceConfig, {"rotation_scale_rad": 0.0}),
         (EvidenceConfig, {"translation_scale_m": -1.0}),
         (StatusConfig, {"ok_confidence": 1.5}),
         (StatusConfig, {"rejected_confidence": 0.9}),
-        (DeloConfig, {"coarse": CoarseConfig(num_neighbors=400)}),
+        (DeloConfig, {"encoder": EncoderConfig(num_neighbors=400)}),
+        (DeloConfig, {"attention": AttentionConfig(num_heads=3)}),  # of 64 channels
+        (DeloConfig, RAW | {"encoder": EncoderConfig(), "fine": FineConfig(num_iters=0), "evidence": EvidenceConfig(head="none")}),
+        (DeloConfig, RAW | {"evidence": EvidenceConfig(head="none")}),  # a fine stage without normals
+        (DeloConfig, RAW | {"fine": FineConfig(num_iters=0)}),  # statistics of no fine stage
         (TrainConfig, {"num_frames": 1}),
         (TrainConfig, {"num_scenes": 0}),
         (TrainConfig, {"num_validation_scenes": 0}),
@@ -129,10 +157,23 @@ def test_wrong_type_is_refused(table, message):
         (TrainConfig, {"num_steps": 9}),
         (TrainConfig, {"num_steps": -10}),
         (TrainConfig, {"num_evidence_steps": 1}),
-        (TrainConfig, {"coarse_weight": -1.0}),
+        (TrainConfig, {"matching_weight": -1.0}),
         (TrainConfig, {"fine_weight": -1.0}),
+        (TrainConfig, {"odometry_weight": -1.0}),
+        (TrainConfig, {"aux_weight": -1.0}),
         (TrainConfig, {"evidence_weight": float("nan")}),
-        (TrainConfig, {"regulariser_weight": -1.0}),
+        (TrainConfig, {"rotation_regulariser": -1.0}),
+        (TrainConfig, {"translation_regulariser": -1.0}),
+        (TrainConfig, {"schedule": "linear"}),
+        (TrainConfig, {"schedule": "steps"}),  # of how many epochs
+        (TrainConfig, {"num_epochs": -1}),
+        (TrainConfig, {"max_gap": 0}),
+        (TrainConfig, {"clip_norm": -1.0}),
+        (TrainConfig, {"warmup_steps": -1}),
+        (TrainConfig, {"pose_loss": "l2"}),
+        (TrainConfig, {"matching_loss": "costs"}),
+        (TrainConfig, {"model": DeloConfig(fine=FineConfig(num_iters=0), evidence=EvidenceConfig(head="none")), "evidence_weight": 0.0}),
+        (TrainConfig, {"model": DeloConfig(evidence=EvidenceConfig(head="none"))}),
         (TrainConfig, {"num_iters": 5}),
         (TrainConfig, {"validate_every": 0}),
     ],

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from delo_jax.config import DeloConfig
 from delo_jax.errors import ScanError
 from delo_jax.geometry import se3
-from delo_jax.inference import Estimate, check_pose, odometry
+from delo_jax.inference import Estimate, check_pose, odometry, prepare, solve
 from delo_jax.model import delo
 from delo_jax.uncertainty.status import STATUSES
-from tests.fixtures import T_street, errors, simulated_clip, street_points, tiny_model
+from tests.fixtures import T_street, errors, narrow_model, simulated_clip, street_points, tiny_model
 from tests.oracles import street
 
 START = street.pose(0.4, -0.2, 0.0, yaw_deg=2.0)
@@ -214,3 +214,48 @@ def test_inverse_carries_the_covariance():
     again = inverse.inverted()
     np.testing.assert_allclose(again.covariance, np.diag(variances), atol=1e-12)
     assert (inverse.status, inverse.confidence, inverse.reason) == ("ok", 0.8, "")
+
+
+def held(model):
+    """The model with status limits that geometry never crosses, so that the evidence alone decides."""
+    limits = dataclasses.replace(model.cfg.status, min_points=10, min_observability=0.0, rejected_confidence=0.0)
+    return delo.Model(model.variables, dataclasses.replace(model.cfg, status=limits))
+
+
+def test_network_without_a_head_says_that_it_knows_nothing():
+    """Oracle: the documented answer; never ok, 30 deg and 5 m, and a sentence; the pose is the network's all the same."""
+    estimate = odometry(held(narrow_model("dcp")), street_points(0), street_points(1), T_target_source_init=START)
+    assert_sound(estimate)
+    assert estimate.status == "low_confidence"
+    assert estimate.reason == "this network has no evidence head: nothing says how far its pose can be trusted"
+    assert estimate.confidence == 0.0
+    np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), [*np.radians([30.0] * 3), 5.0, 5.0, 5.0])
+    assert not np.allclose(estimate.T_target_source, START)
+
+
+@pytest.mark.parametrize("preset", ["paper", "official"])
+def test_evidence_of_embeddings_becomes_a_covariance(preset):
+    """Oracle: Monte Carlo. Poses drawn as independent angles and translations of the head's variances, relative to the estimate.
+
+    Variances to 3 %; the covariance is symmetric, positive definite and not below that of the draws.
+    """
+    model = held(narrow_model(preset))
+    estimate = odometry(model, street_points(0), street_points(1))
+    assert_sound(estimate)
+    assert estimate.status in ("ok", "low_confidence")
+    encoded = [prepare(model, street_points(frame)).encoding for frame in (0, 1)]
+    found = solve(model, *encoded, np.eye(4, dtype=np.float32))
+    _, nu, alpha, beta = (np.asarray(value, np.float64) for value in found.nig)
+    T = np.asarray(found.T_target_source, np.float64)
+    angles = Rotation.from_matrix(T[:3, :3]).as_euler("XYZ")
+    aleatoric, epistemic = beta / (alpha - 1), beta / (nu * (alpha - 1))
+    shrink = 1e-4  # of the variances, so that no angle is folded
+    noise = np.random.default_rng(0).normal(size=(200_000, 6)) * np.sqrt(shrink * (aleatoric + epistemic))
+    R = Rotation.from_euler("XYZ", angles + noise[:, :3]).as_matrix()
+    apart = np.hstack([Rotation.from_matrix(T[:3, :3].T @ R).as_rotvec(), noise[:, 3:] @ T[:3, :3]])
+    spread = np.cov(apart.T) / shrink
+    np.testing.assert_allclose(estimate.aleatoric + estimate.epistemic, np.diag(spread), rtol=0.03)
+    scale = np.sqrt(np.outer(np.diag(spread), np.diag(spread)))
+    assert np.linalg.eigvalsh((estimate.covariance - spread) / scale).min() > -0.05  # the square of the expected error is in it too
+    expected = np.clip(1.0 - epistemic.max(), 0.0, 1.0)
+    np.testing.assert_allclose(estimate.confidence, expected, atol=1e-4)

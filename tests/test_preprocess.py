@@ -229,3 +229,71 @@ def test_one_point_is_kept_of_each_voxel(seed):
     rows = one_per_voxel(points, 0.7, np.random.default_rng(seed))
     assert len(rows) == len({cells[row] for row in rows}) == len(set(cells))
     assert not np.array_equal(rows, one_per_voxel(points, 0.7, np.random.default_rng(seed + 1)))
+
+
+RAW = PreprocessConfig(sampling="raw", max_points=100, num_keypoints=100)
+
+
+def numbered(num):
+    """Points that say which row they are."""
+    return np.stack([np.arange(num), np.full(num, 0.5), -np.arange(num)], axis=1).astype(np.float32)
+
+
+def assert_raw(scan, num_valid):
+    assert [array.shape for array in scan] == [(100, 3), (0, 3), (0, NUM_FEATURES), (100,), (100,), (100,)]
+    assert [array.dtype for array in scan] == [np.float32] * 3 + [bool, np.int32, bool]
+    np.testing.assert_array_equal(scan.mask, np.arange(100) < num_valid)
+    np.testing.assert_array_equal(scan.keypoint_mask, scan.mask)
+    np.testing.assert_array_equal(scan.keypoint_index, np.arange(100))
+    assert not scan.points[num_valid:].any()
+
+
+@pytest.mark.parametrize("num", [100, 101, 150, 999, 12_345])
+def test_raw_points_are_evenly_spaced_rows(num):
+    """Oracle: floor(k num / 100), by integers; the points are as they were, in an order that is not that of the sensor."""
+    scan = preprocess(numbered(num), RAW)
+    assert_raw(scan, 100)
+    rows = scan.points[:, 0].astype(int)
+    np.testing.assert_array_equal(np.sort(rows), [k * num // 100 for k in range(100)])
+    np.testing.assert_array_equal(scan.points, numbered(num)[rows])
+    assert abs(np.corrcoef(rows, np.arange(100))[0, 1]) < 0.5
+
+
+@pytest.mark.parametrize("num", [0, 1, 7, 99])
+def test_few_raw_points_are_all_kept(num):
+    """Oracle: the input as a set; the rest is padding."""
+    scan = preprocess(numbered(num), RAW)
+    assert_raw(scan, num)
+    np.testing.assert_array_equal(np.sort(scan.points[:num, 0]), np.arange(num))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_raw_points_that_are_no_numbers_are_dropped(bad):
+    """Oracle: the same scan without them; points beside the sensor and far away stay, since nothing is cropped."""
+    points = numbered(500)
+    points[3] = [0.0, 0.0, 0.0]
+    points[4] = [1e4, 0.0, 0.0]
+    dirty = np.insert(points, [0, 17, 17, 400, 500], bad, axis=0)
+    dirty[0, :2] = 1.0  # one bad coordinate is enough
+    clean, found = preprocess(points[:90], RAW), preprocess(dirty[: 90 + 3], RAW)
+    assert_raw(found, 90)
+    np.testing.assert_array_equal(found.points, clean.points)
+    assert {0.0, 1e4} <= set(np.abs(found.points[:90]).max(axis=1).tolist())
+    assert_raw(preprocess(np.full((1000, 3), bad), RAW), 0)
+
+
+def test_same_raw_scan_same_bytes():
+    """Oracle: repetition, on a copy in another dtype; the input is left as it was."""
+    points = street.scan(street.pose(), noise_m=0.02).points
+    before = points.tobytes()
+    first, second = preprocess(points, RAW), preprocess(points.astype(np.float64), RAW)
+    assert points.tobytes() == before
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(first, second, strict=True))
+
+
+def test_first_raw_rows_are_an_even_subset():
+    """Oracle: a two-sample Kolmogorov-Smirnov test of azimuth, range and height of the first rows against the others."""
+    cfg = PreprocessConfig(sampling="raw", max_points=1024, num_keypoints=1024)
+    points = preprocess(street.scan(street.pose()).points, cfg).points
+    for values in (np.arctan2(points[:, 1], points[:, 0]), np.linalg.norm(points, axis=1), points[:, 2]):
+        assert ks_2samp(values[:512], values[512:]).pvalue > 1e-3

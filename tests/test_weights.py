@@ -132,11 +132,11 @@ def test_damaged_card_is_one_sentence(stored, content, message):
         weights.load(stored)
 
 
-@pytest.mark.parametrize("config", [None, 3, {"nmae": "tiny"}, {"coarse": {"mass": 7.0}}])
+@pytest.mark.parametrize("config", [None, 3, {"nmae": "tiny"}, {"matching": {"mass": 7.0}}])
 def test_card_without_a_usable_config_is_one_sentence(stored, config):
     """Oracle: an error that this package raises on purpose, naming the file."""
     change_card(stored, config=config)
-    with pytest.raises(DeloError, match="tiny|coarse.mass"):
+    with pytest.raises(DeloError, match="tiny|matching.mass"):
         weights.load(stored)
 
 

@@ -23,13 +23,18 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train(Command):
-    """Weights from simulated worlds; an interrupted training goes on when the same command is given again.
+    """Weights from simulated worlds, or from recorded sequences; an interrupted training goes on when the same command is given again.
 
     Example: delo train base --out runs/train-base
+    Example: delo train paper --data kitti/dataset
     """
 
     what: tyro.conf.Positional[str]
-    """Preset (base), or a TOML file such as --dump-config prints."""
+    """Preset (base, tiny, paper, official, dcp), or a TOML file such as --dump-config prints."""
+    data: Path | None = None
+    """KITTI odometry tree to train on, with poses; simulation when not given."""
+    sequences: tuple[str, ...] = ("00", "01", "02", "03", "04", "05", "06")
+    """Sequences of that tree; the last tenth of each is for validation."""
     out: Path | None = None
     """Folder for worlds, checkpoints and weights; runs/train-NAME by default."""
 
@@ -38,10 +43,12 @@ class Train(Command):
         from delo_jax.train.presets import PRESETS
 
         if self.what in PRESETS:
-            return PRESETS[self.what]
-        if not Path(self.what).exists():
+            cfg = PRESETS[self.what]
+        elif Path(self.what).exists():
+            cfg = config.load(config.TrainConfig, Path(self.what))
+        else:
             raise ConfigError(f"{self.what}: expected a preset ({', '.join(PRESETS)}) or a TOML file, got neither; check the name")
-        return config.load(config.TrainConfig, Path(self.what))
+        return cfg if self.data is None else dataclasses.replace(cfg, recorded=" ".join(self.sequences))
 
     def run(self) -> int:
         """Trains, prints the errors on unseen worlds and writes the weights."""
@@ -51,14 +58,16 @@ class Train(Command):
         from delo_jax.train.loop import train
 
         out = self.out or Path("runs") / f"train-{Path(self.what).stem}"
-        command = shlex.join(["delo", "train", self.what, *([] if self.out is None else ["--out", str(out)])])
+        given = {"--out": [self.out], "--data": [self.data], "--sequences": self.sequences if self.data else [None]}
+        options = [str(word) for name, values in given.items() if values[0] is not None for word in (name, *values)]
+        command = shlex.join(["delo", "train", self.what, *options])
         try:
             with progress("steps") as bar:
-                model, errors = train(cfg, out, BarReporter(bar))
+                model, errors, num_nonfinite = train(cfg, out, BarReporter(bar), self.data)
         except KeyboardInterrupt:
             print(f"delo: interrupted; worlds and checkpoints are kept, to go on: {command}", file=sys.stderr)
             return 1
-        path = weights.save(out / f"delo-{cfg.model.name}", model, card(cfg, command, errors))
+        path = weights.save(out / f"delo-{cfg.model.name}", model, card(cfg, command, errors, num_nonfinite))
         print_errors("errors on unseen worlds", errors)
         print(f"weights and card: {path}")
         return 0
@@ -97,20 +106,22 @@ def print_errors(title: str, errors: "list[GapErrors]") -> None:
     print_table(title, header, rows, right=range(len(header)))
 
 
-def card(cfg: config.TrainConfig, command: str, errors: "list[GapErrors]") -> dict[str, Any]:
+def card(cfg: config.TrainConfig, command: str, errors: "list[GapErrors]", num_nonfinite: int) -> dict[str, Any]:
     """What a user of the weights should know; `weights.save` adds config, format and SHA-256."""
     from delo_jax.sim import KINDS
     from delo_jax.train.worlds import SEEDS_PER_RUN, VALIDATION_SEED
 
     scenes = f"{cfg.num_scenes} simulated scenes of {cfg.num_frames} scans, kinds {', '.join(KINDS)}; no recorded data"
+    recorded = f"recorded sequences {cfg.recorded}, the last tenth of each for validation; no simulated data"
+    held_out = f"worlds from seed {cfg.seed * SEEDS_PER_RUN + VALIDATION_SEED} on, never trained on"
     names = "jax", "flax", "optax", "numpy"
     return {
         "name": f"delo-{cfg.model.name}",
-        "data": scenes,
-        "seeds": {"base": cfg.seed, "validation": f"worlds from seed {cfg.seed * SEEDS_PER_RUN + VALIDATION_SEED} on, never trained on"},
+        "data": recorded if cfg.recorded else scenes,
+        "seeds": {"base": cfg.seed} | ({} if cfg.recorded else {"validation": held_out}),
         "commands": [command],
         "training": config_table(cfg),
-        "steps": {"matching and pose": cfg.num_steps, "evidence": cfg.num_evidence_steps},
+        "steps left out as not finite": num_nonfinite,
         "metrics": [row._asdict() for row in errors],
         "versions": {"delo-jax": __version__, "python": platform.python_version(), **{name: version(name) for name in names}},
         "date": time.strftime("%Y-%m-%d", time.gmtime()),

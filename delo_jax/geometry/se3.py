@@ -172,6 +172,22 @@ def from_pose6(pose: Float[AnyArray, " 6"]) -> Float[AnyArray, "4 4"]:
 
 
 @full_float32
+def pose6_jacobian(pose: Float[AnyArray, " 6"]) -> Float[AnyArray, "6 6"]:
+    """Right perturbation `[omega, v]` of a pose per change of its `pose6`: log(T^-1 from_pose6(pose + d)) = J d, to first order.
+
+    T is `from_pose6(pose)`. The columns of the angles are the three axes as the body sees them: x of the reference frame for the
+    roll, y turned by the yaw for the pitch, the body's own z for the yaw. At a pitch of +-90 deg the first and the last are parallel.
+    """
+    xp = _namespace(pose)
+    R = from_pose6(pose)[:3, :3]
+    cz, sz = xp.cos(pose[2]), xp.sin(pose[2])
+    zero, one = xp.zeros_like(cz), xp.ones_like(cz)
+    angles = xp.stack([R[0], xp.stack([sz, cz, zero]), xp.stack([zero, zero, one])], axis=1)
+    zeros = xp.zeros_like(R)
+    return xp.concatenate([xp.concatenate([angles, zeros], axis=1), xp.concatenate([zeros, R.T], axis=1)], axis=0)
+
+
+@full_float32
 def compose_covariance(
     covariance_a: Float[AnyArray, "6 6"], covariance_b: Float[AnyArray, "6 6"], T_b: Float[AnyArray, "4 4"]
 ) -> Float[AnyArray, "6 6"]:

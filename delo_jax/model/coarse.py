@@ -1,4 +1,4 @@
-"""Coarse stage: transport plan between key points, consistency of pairs, planar pose."""
+"""From a plan between key points to a pose: Procrustes on the plan, on best matches, or on best matches that agree."""
 
 from typing import NamedTuple
 
@@ -6,57 +6,77 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from delo_jax.config import CoarseConfig
+from delo_jax.config import PoseConfig
 from delo_jax.geometry import se3
-from delo_jax.geometry.procrustes import planar_procrustes
+from delo_jax.geometry.procrustes import is_determined, planar_procrustes, weighted_procrustes
 from delo_jax.geometry.se3 import full_float32
 from delo_jax.ops.consistency import consistency_weights
-from delo_jax.ops.transport import partial_transport
+from delo_jax.ops.matching import barycentric_projection
 
 
 class CoarsePose(NamedTuple):
-    """Answer of the coarse stage."""
+    """Pose of a plan, and what it was computed from."""
 
-    T_target_source: Float[Array, "4 4"]  # yaw and translation; roll and pitch are left to the fine stage
+    T_target_source: Float[Array, "4 4"]
     inlier_share: Float[Array, ""]  # share of the source key points whose match fits the pose
+    matched: Float[Array, "n 3"]  # target point of every source point [m]
+    weights: Float[Array, " n"]  # weights of the matches
+    determined: Bool[Array, ""]  # whether the matches fix a rotation
 
 
 @full_float32
 def coarse_pose(
-    cost: Float[Array, "n m"],
+    plan: Float[Array, "n m"],
     source: Float[Array, "n 3"],
     target: Float[Array, "m 3"],
     source_mask: Bool[Array, " n"],
-    target_mask: Bool[Array, " m"],
     *,
-    cfg: CoarseConfig,
+    cfg: PoseConfig,
 ) -> CoarsePose:
-    """Pose from matching costs: partial transport, best match per row, pairwise consistency, reweighted Procrustes.
+    """Pose from a plan.
+
+    `procrustes` is the paper's: matched points are the plan's averages of target points, weights its row sums. `argmax`
+    takes the best target of each row. `consistency` also weighs those by how well they agree in pairs, and solves for
+    yaw and translation alone (roll and pitch are the fine stage's), with reweighted rounds.
 
     Args:
-        cost: matching cost, rows source, columns target.
+        plan: >= 0, rows source, columns target; zero in padded rows and columns.
         source: key points in the source frame [m].
         target: key points in the target frame [m].
         source_mask: True where a source key point is real.
-        target_mask: the same for the target.
-        cfg: mass, iterations and scales.
+        cfg: solver and scales.
 
     Returns:
-        The planar pose and the share of matches that fit it.
+        T_target_source with the matches and weights that gave it.
     """
-    plan = partial_transport(cost, jnp.ones(()), mass=cfg.mass, num_iters=cfg.num_iters, row_mask=source_mask, column_mask=target_mask)
-    best = jnp.argmax(plan, axis=1)
-    strength = jnp.max(plan, axis=1) * jnp.sum(source_mask)
-    matched = target[best]
-    weights = consistency_weights(source, matched, jnp.where(source_mask, strength, 0.0), scale=cfg.consistency_m)
-    T = planar_procrustes(source, matched, weights)
+    if cfg.solver == "procrustes":
+        matched, weights = barycentric_projection(plan, target)
+    else:
+        matched = target[jnp.argmax(plan, axis=1)]
+        weights = jnp.where(source_mask, jnp.max(plan, axis=1) * jnp.sum(source_mask), 0.0)
+    if cfg.solver == "consistency":
+        weights = consistency_weights(source, matched, weights, scale=cfg.consistency_m)
+        T, num_inliers = _reweighted(source, matched, weights, source_mask, cfg)
+    else:
+        T = weighted_procrustes(source, matched, weights)
+        num_inliers = jnp.sum(_inliers(T, source, matched, source_mask, cfg)[0])
+    share = num_inliers / jnp.maximum(jnp.sum(source_mask), 1)
+    return CoarsePose(T, share, matched, weights, is_determined(source, matched, weights))
+
+
+def _inliers(T, source, matched, mask, cfg):
+    """Whether each match fits a pose, and its squared residual [m^2]."""
+    squared = jnp.sum((se3.transform(T, source) - matched) ** 2, axis=1)
+    return (squared < cfg.consistency_m**2) & mask, squared
+
+
+def _reweighted(source, matched, weights, mask, cfg):
+    """Planar pose after rounds in which far matches count less and near ones come back; and how many fitted the last but one."""
 
     def reweight(_, carry):
-        T, _ = carry
-        squared = jnp.sum((se3.transform(T, source) - matched) ** 2, axis=1)
+        inliers, squared = _inliers(carry[0], source, matched, mask, cfg)
         robust = 1.0 / (1.0 + squared / cfg.consistency_m**2) ** 2
-        inlier = (squared < cfg.consistency_m**2) & source_mask
-        return planar_procrustes(source, matched, (weights + 1e-3 / weights.shape[0]) * robust * source_mask), jnp.sum(inlier)
+        return planar_procrustes(source, matched, (weights + 1e-3 / weights.shape[0]) * robust * mask), jnp.sum(inliers)
 
-    T, num_inliers = jax.lax.fori_loop(0, cfg.num_rounds, reweight, (T, jnp.zeros((), jnp.int32)))
-    return CoarsePose(T, num_inliers / jnp.maximum(jnp.sum(source_mask), 1))
+    start = planar_procrustes(source, matched, weights), jnp.zeros((), jnp.int32)
+    return jax.lax.fori_loop(0, cfg.num_rounds, reweight, start)

@@ -1,73 +1,51 @@
 """The model: one params pytree, `encode` once per scan, `solve` once per pair. Pure functions; the caller jits."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from delo_jax.config import NUM_FEATURES, DeloConfig
+from delo_jax.config import DeloConfig
 from delo_jax.geometry import se3
 from delo_jax.geometry.point_to_plane import point_to_plane_step
 from delo_jax.geometry.se3 import full_float32
 from delo_jax.model import fine
+from delo_jax.model.attention import CloudContext
 from delo_jax.model.coarse import CoarsePose, coarse_pose
-from delo_jax.model.dgcnn import EdgeEncoder
-from delo_jax.model.evidential import EvidenceHead
-from delo_jax.model.matching import Temperature
-from delo_jax.model.statistics import NUM_STATISTICS, consensus, statistics
+from delo_jax.model.network import Network, example_inputs
+from delo_jax.model.statistics import consensus, statistics
 from delo_jax.ops import evidence
 from delo_jax.ops.knn import knn
-from delo_jax.ops.transport import matching_cost
+
+T = TypeVar("T")
 
 
-class Network(nn.Module):
-    """All trained layers; each method is one of them."""
+@runtime_checkable
+class Applicable(Protocol):
+    """What `encode` and `solve` need of a model: its config, and its layers as functions."""
 
-    cfg: DeloConfig
+    @property
+    def cfg(self) -> DeloConfig:
+        """Of the network."""
 
-    def setup(self):
-        """Name the layers."""
-        self.encoder = EdgeEncoder(self.cfg.coarse)
-        self.matcher = Temperature()
-        self.point_embedding = fine.PointEmbedding(self.cfg.fine)
-        self.edge_network = fine.EdgeNetwork(self.cfg.fine)
-        self.evidence_head = EvidenceHead(self.cfg.evidence)
+    def apply(self, method: str, *args) -> Any:
+        """One layer of the network."""
 
-    def embed(self, features):
-        """Point embeddings of the fine stage."""
-        return self.point_embedding(features)
-
-    def describe(self, points, features, index, mask):
-        """Descriptors of key points."""
-        return self.encoder(points, features, index, mask)
-
-    def temperature(self):
-        """Factor on the cosine similarities of descriptors."""
-        return self.matcher()
-
-    def confidence(self, source, target, geometry):
-        """Logits of the fine stage."""
-        return self.edge_network(source, target, geometry)
-
-    def evidence(self, statistics):
-        """Raw evidence."""
-        return self.evidence_head(statistics)
-
-    def everything(self, points, features, geometry, statistics):
-        """One call of every layer, for `init`."""
-        index = jnp.zeros((points.shape[0], self.cfg.coarse.num_neighbors), jnp.int32)
-        descriptors = self.describe(points, jnp.concatenate([points, features], -1), index, jnp.ones(points.shape[0], bool))
-        embedding = self.embed(features)
-        return descriptors, self.temperature(), self.confidence(embedding, embedding, geometry), self.evidence(statistics)
+    def confidence(self, source, target, geometry) -> Any:
+        """Logits of the fine stage, as a function to pass on."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """Weights and the config they belong to. Arrays are leaves, the config is static."""
+    """Weights and the config they belong to. Arrays are leaves, the config is static.
+
+    `variables` holds "params" and, where the preset has batch normalisation, its running statistics, "batch_stats".
+    """
 
     variables: dict[str, Any]
     cfg: DeloConfig = dataclasses.field(metadata={"static": True})
@@ -81,69 +59,120 @@ class Model:
         return self.apply("confidence", source, target, geometry)
 
 
+@dataclasses.dataclass(frozen=True)
+class _InTraining:
+    """A network that sees the statistics of its batch and gathers running ones."""
+
+    network: Network
+    model: Model
+
+    @property
+    def cfg(self):
+        return self.model.cfg
+
+    def apply(self, method, *args):
+        return getattr(self.network, method)(*args)
+
+    def confidence(self, source, target, geometry):
+        return self.model.confidence(source, target, geometry)  # has no statistics, and is called within loops
+
+
+def apply_in_training(model: Model, function: Callable[..., T], *args) -> tuple[T, dict[str, Any]]:
+    """`function(model, *args)` in training mode, and the updated running statistics.
+
+    Args:
+        model: weights.
+        function: takes a model first; one item, under `jax.vmap(..., axis_name="batch")`.
+        args: the rest of its arguments.
+
+    Returns:
+        The value of the function, and {"batch_stats": ...}, or {} where the network has no batch normalisation.
+    """
+
+    def bound(network, *args):
+        return function(_InTraining(network, model), *args)
+
+    return nn.apply(bound, Network(model.cfg, train=True), mutable=["batch_stats"])(model.variables, *args)
+
+
 class Encoding(NamedTuple):
     """What is computed once per scan and kept."""
 
     cloud: fine.Cloud
     keypoints: Float[Array, "k 3"]
-    keypoint_normals: Float[Array, "k 3"]
+    keypoint_normals: Float[Array, "s 3"]  # s = k, or 0 where the scan has none
     keypoint_mask: Bool[Array, " k"]
     descriptors: Float[Array, "k d"]
+    context: CloudContext  # without rows where the preset has no transformer
+
+
+class Matching(NamedTuple):
+    """Plan between the key points of two scans, with the descriptors it was made of."""
+
+    source: Float[Array, "n d"]
+    target: Float[Array, "m d"]
+    plan: Float[Array, "n m"]
 
 
 class Registration(NamedTuple):
     """Answer of one pair; arrays only."""
 
     T_target_source: Float[Array, "4 4"]
-    information: Float[Array, "6 6"]  # of the planes, for a right perturbation of the pose, per unit of weight
-    nig: evidence.NIG  # of log(T_pred^-1 T_true), order [omega, v], rad and m
-    confidence: Float[Array, ""]  # probability that the pair is not lost
-    statistics: Float[Array, " s"]
+    information: Float[Array, "6 6"]  # of planes or points, for a right perturbation of the pose, per unit of weight
+    nig: evidence.NIG  # `statistics` head: of log(T_pred^-1 T_true), [omega, v]; `embedding`: of pose6 of the true T; `none`: NaN
+    confidence: Float[Array, ""]  # that the pair is not lost; `embedding`: the paper's 1 - Var[mu], worst axis; `none`: NaN
+    statistics: Float[Array, " s"]  # of the fine stage; empty without one
     used_coarse: Bool[Array, ""]  # the pose came from the coarse stage, not from T_init
-    finite: Bool[Array, ""]
+    finite: Bool[Array, ""]  # the pose is a number, and the matches determine it
 
 
 def init(cfg: DeloConfig, key: Key[Array, ""]) -> Model:
     """Model with random weights, for training only."""
-    points, features = jnp.zeros((4, 3)), jnp.zeros((4, NUM_FEATURES))
-    geometry, _, _ = fine.match_geometry(points, points, points, points, jnp.ones(4, bool))
-    variables = Network(cfg).init(key, points, features, geometry, jnp.zeros(NUM_STATISTICS), method="everything")
-    return Model(dict(variables), cfg)
+    return Model(dict(Network(cfg).init(key, *example_inputs(cfg), method="everything")), cfg)
 
 
-def encode(model: Model, scan) -> Encoding:
+def encode(model: Applicable, scan) -> Encoding:
     """Point embeddings and key point descriptors of a `Scan`."""
-    cloud = fine.Cloud(scan.points, scan.normals, model.apply("embed", scan.features), scan.mask)
-    rows, mask = scan.keypoint_index, scan.keypoint_mask
-    points, normals = scan.points[rows], scan.normals[rows]
-    index = knn(points, mask, model.cfg.coarse.num_neighbors)
-    features = jnp.concatenate([normals, scan.features[rows]], axis=-1)
-    return Encoding(cloud, points, normals, mask, model.apply("describe", points, features, index, mask))
+    cfg, rows, mask = model.cfg, scan.keypoint_index, scan.keypoint_mask
+    has_normals = scan.normals.shape[0] > 0
+    points, normals = scan.points[rows], scan.normals[rows] if has_normals else scan.normals
+    index = knn(points, mask, cfg.encoder.num_neighbors)
+    features = jnp.concatenate([normals, scan.features[rows]], axis=-1) if has_normals else scan.features
+    descriptors = model.apply("describe", points, features, index, mask)
+    embedding = model.apply("embed", scan.features) if cfg.fine.num_iters else scan.features
+    if cfg.attention.num_heads:
+        context = model.apply("contextualise", descriptors, mask)
+    else:
+        nothing = descriptors[:0]
+        context = CloudContext(nothing, nothing, nothing, nothing, nothing, mask[:0])
+    return Encoding(fine.Cloud(scan.points, scan.normals, embedding, scan.mask), points, normals, mask, descriptors, context)
 
 
-def matching_scores(model: Model, source: Encoding, target: Encoding) -> Float[Array, "n m"]:
-    """Scores between the key points of two scans."""
-    return model.apply("temperature") * (source.descriptors @ target.descriptors.T)
+def match(model: Applicable, source: Encoding, target: Encoding) -> Matching:
+    """Descriptors, each in the context of the other scan where there is a transformer, and the plan between them."""
+    ours, theirs = source.descriptors, target.descriptors
+    if model.cfg.attention.num_heads:
+        ours, theirs = (model.apply("attend", *pair) for pair in ((source.context, target.context), (target.context, source.context)))
+    return Matching(ours, theirs, model.apply("plan", ours, theirs, source.keypoint_mask, target.keypoint_mask))
 
 
-def coarse(model: Model, source: Encoding, target: Encoding) -> CoarsePose:
+def coarse(model: Applicable, source: Encoding, target: Encoding, plan: Float[Array, "n m"]) -> CoarsePose:
     """Pose with no prior, from the key points alone."""
-    cost = matching_cost(source.descriptors, target.descriptors, model.apply("temperature"), target.keypoint_mask)
-    return coarse_pose(cost, source.keypoints, target.keypoints, source.keypoint_mask, target.keypoint_mask, cfg=model.cfg.coarse)
+    return coarse_pose(plan, source.keypoints, target.keypoints, source.keypoint_mask, cfg=model.cfg.pose)
 
 
-def refine_pose(model: Model, source: fine.Cloud, target: fine.Cloud, T_init, *, num_iters: int) -> Float[Array, "t 4 4"]:
+def refine_pose(model: Applicable, source: fine.Cloud, target: fine.Cloud, T_init, *, num_iters: int) -> Float[Array, "t 4 4"]:
     """Fine stage from a start; `target` is any cloud with normals and embeddings."""
     return fine.refine(model.confidence, source, target, T_init, num_iters=num_iters, cfg=model.cfg.fine)
 
 
 @full_float32
-def solve(model: Model, source: Encoding, target: Encoding, T_init: Float[Array, "4 4"]) -> Registration:
-    """Pose of a pair, its information, evidence and statistics.
+def solve(model: Applicable, source: Encoding, target: Encoding, T_init: Float[Array, "4 4"]) -> Registration:
+    """Pose of a pair, its information and evidence.
 
-    Two hypotheses, the start and the coarse pose, are refined side by side on half of the points; the one that more
-    points agree with is finished on all of them. A good start is never spoilt by a bad coarse pose,
-    and a bad start never hides a good one.
+    With a fine stage, two hypotheses, the start and the coarse pose, are refined side by side on half of the points; the
+    one that more points agree with is finished on all of them. A good start is never spoilt by a bad coarse pose,
+    and a bad start never hides a good one. Without one (the paper's presets) the coarse pose is the answer.
 
     Args:
         model: weights and config.
@@ -154,9 +183,12 @@ def solve(model: Model, source: Encoding, target: Encoding, T_init: Float[Array,
     Returns:
         Registration with T_target_source.
     """
+    matching = match(model, source, target)
+    first = coarse(model, source, target, matching.plan)
+    if model.cfg.fine.num_iters == 0:
+        return _unrefined(model, source, target, matching, first)
     cfg = model.cfg.fine
     points, half = _first(source.cloud, cfg.num_points), _first(source.cloud, cfg.num_points // 2)
-    first = coarse(model, source, target)
     starts = jnp.stack([T_init, first.T_target_source])
     num_first = cfg.num_iters // 2
     refined = jax.vmap(lambda T: refine_pose(model, half, target.cloud, T, num_iters=num_first)[-1])(starts)
@@ -167,21 +199,53 @@ def solve(model: Model, source: Encoding, target: Encoding, T_init: Float[Array,
     T_delta, information = fine.step(matches, cfg=cfg)
     disagreement = se3.inverse(refined[1 - best]) @ refined[best]
     stats = statistics(matches, information, T, T_delta, disagreement, first.inlier_share, scores[1 - best])
-    nig, success_logit = predict_evidence(model, stats)
     planes = _plane_information(matches, T)
     finite = jnp.all(jnp.isfinite(T)) & jnp.all(jnp.isfinite(stats)) & jnp.all(jnp.isfinite(planes))
-    return Registration(T, planes, nig, nn.sigmoid(success_logit), stats, best == 1, finite)
+    nig, confidence = predict_evidence(model, source, target, matching, T, stats)
+    return Registration(T, planes, nig, confidence, stats, best == 1, finite)
 
 
-def predict_evidence(model: Model, stats: Float[Array, " s"]) -> tuple[evidence.NIG, Float[Array, ""]]:
+def _unrefined(model, source, target, matching, first):
+    """The coarse pose as the answer."""
+    T = first.T_target_source
+    information = _point_information(source.keypoints, first.weights)
+    finite = jnp.all(jnp.isfinite(T)) & first.determined
+    nig, confidence = predict_evidence(model, source, target, matching, T, jnp.zeros(0))
+    return Registration(T, information, nig, confidence, jnp.zeros(0), jnp.ones((), bool), finite)
+
+
+def predict_evidence(
+    model: Applicable, source: Encoding, target: Encoding, matching: Matching, T: Float[Array, "4 4"], stats: Float[Array, " s"]
+) -> tuple[evidence.NIG, Float[Array, ""]]:
+    """Evidence and confidence of a pose, by the head that the preset has; see `Registration`."""
+    head = model.cfg.evidence.head
+    if head == "statistics":
+        nig, logit = evidence_of_statistics(model, stats)
+        return nig, nn.sigmoid(logit)
+    if head == "none":
+        return evidence.NIG(*[jnp.full(6, jnp.nan)] * 4), jnp.full((), jnp.nan)
+    nig = evidence_of_embedding(model, source, target, matching, T)
+    return nig, jnp.clip(1.0 - jnp.max(evidence.moments(nig).epistemic), 0.0, 1.0)
+
+
+def evidence_of_statistics(model: Applicable, stats: Float[Array, " s"]) -> tuple[evidence.NIG, Float[Array, ""]]:
     """Evidence of the pose error in rad and m, and the logit of the pair not being lost."""
     raw, success_logit = model.apply("evidence", stats)
     nig, unit = evidence.constrain(raw), evidence_units(model.cfg)
     return evidence.NIG(nig.gamma * unit, nig.nu, nig.alpha, nig.beta * unit**2), success_logit
 
 
+def evidence_of_embedding(
+    model: Applicable, source: Encoding, target: Encoding, matching: Matching, T: Float[Array, "4 4"]
+) -> evidence.NIG:
+    """The paper's PU-EPE: evidence of pose6 of the true pose, from pooled descriptors and the predicted pose."""
+    pooled = matching[:2] if model.cfg.evidence.embedding == "context" else (source.descriptors, target.descriptors)
+    raw = model.apply("evidence", *pooled, source.keypoint_mask, target.keypoint_mask, se3.pose6(T))
+    return evidence.constrain(raw, log_beta=False)
+
+
 def evidence_units(cfg: DeloConfig) -> Float[Array, "6"]:
-    """Units in which the evidence head counts errors, order [omega, v], rad and m."""
+    """Units in which the `statistics` head counts errors, order [omega, v], rad and m."""
     return jnp.repeat(jnp.array([cfg.evidence.rotation_scale_rad, cfg.evidence.translation_scale_m]), 3)
 
 
@@ -194,3 +258,12 @@ def _plane_information(matches: fine.Matches, T: Float[Array, "4 4"]) -> Float[A
     step = point_to_plane_step(*matches[:3], matches.weights, jnp.zeros_like(matches.weights), damping=0.0)
     Ad = se3.adjoint(T)
     return Ad.T @ step.information @ Ad / (jnp.sum(matches.weights) + 1e-6)
+
+
+def _point_information(points: Float[Array, "n 3"], weights: Float[Array, " n"]) -> Float[Array, "6 6"]:
+    """Gauss-Newton matrix of the distances between matched points, for a right perturbation; zero without weight."""
+    total = jnp.sum(weights)
+    share = weights / jnp.where(total > 0, total, 1.0)
+    eye = jnp.broadcast_to(jnp.eye(3), (points.shape[0], 3, 3))
+    jacobian = jnp.concatenate([-se3.skew(points), eye], axis=-1)  # of R^T d(T x) by [omega, v]
+    return jnp.einsum("n,nki,nkj->ij", share, jacobian, jacobian)

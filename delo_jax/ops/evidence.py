@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 _FLOOR = 1e-3  # keeps nu and alpha - 1, which are divisors, away from zero
 _LOG_BETA_RANGE = (-25.0, 10.0)
+_BETA_FLOOR = 1e-6  # keeps softplus, which underflows to 0, and with it log(beta) and the variances
 
 
 class NIG(NamedTuple):
@@ -33,19 +34,23 @@ class Moments(NamedTuple):
     """Var[mu]: doubt about the mean; relative, not absolute (Bengs et al. 2023)."""
 
 
-def constrain(raw: Float[Array, "*b 24"]) -> NIG:
+def constrain(raw: Float[Array, "*b 24"], *, log_beta: bool = True) -> NIG:
     """Valid parameters from 24 unconstrained numbers: four groups of six, gamma, nu, alpha, beta.
 
     nu and alpha go through softplus, as in the paper. beta goes through exp: pose errors span five decades (1e-5 rad
     to metres), so their squares ten, and softplus, linear for large and flat for small inputs, would need raw values
     and gradients over the same ten decades. The clip is where exp would leave float32's comfort; it stops the gradient.
+
+    Args:
+        raw: the network's last layer.
+        log_beta: static; False gives the paper's beta, softplus, with a floor of 1e-6 that the paper and its code lack.
     """
     gamma, nu, alpha, beta = jnp.split(raw, 4, axis=-1)
     return NIG(
         gamma=gamma,
         nu=_FLOOR + jax.nn.softplus(nu),
         alpha=1.0 + _FLOOR + jax.nn.softplus(alpha),
-        beta=jnp.exp(jnp.clip(beta, *_LOG_BETA_RANGE)),
+        beta=jnp.exp(jnp.clip(beta, *_LOG_BETA_RANGE)) if log_beta else _BETA_FLOOR + jax.nn.softplus(beta),
     )
 
 

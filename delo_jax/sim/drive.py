@@ -40,6 +40,7 @@ def simulate_clip(
     num_columns: int | None = None,
     turning_share: float = 0.35,
     rolling_shutter_share: float = 0.75,
+    traffic: float = 1.0,
 ) -> list[SimulatedScan]:
     """Consecutive scans of a random world, for training; a function of its arguments alone.
 
@@ -51,12 +52,13 @@ def simulate_clip(
         num_columns: replaces the sensor's own.
         turning_share: share of clips with free turning rather than lane keeping.
         rolling_shutter_share: share of clips delivered as measured.
+        traffic: density of the moving traffic, as a factor.
     """
     sensor = _resolve(sensor, num_columns)
     rng = np.random.default_rng([seed, KINDS.index(kind), 5])
     turning, rolling_shutter = rng.uniform() < turning_share, bool(rng.uniform() < rolling_shutter_share)
     motion_seed, unit_seed, noise_seed = (int(s) for s in rng.integers(0, 2**31, 3))
-    scene = make_scene(kind, seed)
+    scene = make_scene(kind, seed, traffic=traffic)
     motion = make_motion(
         motion_seed,
         num_frames * sensor.period_s,

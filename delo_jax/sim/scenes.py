@@ -45,15 +45,17 @@ class Scene(NamedTuple):
     warp: Warp
 
 
-def make_scene(kind: str, seed: int, length_m: float = 120.0) -> Scene:
+def make_scene(kind: str, seed: int, length_m: float = 120.0, *, traffic: float = 1.0) -> Scene:
     """A random scene of one kind, a function of its arguments alone.
 
     Args:
         kind: one of `KINDS`.
         seed: of everything drawn.
         length_m: of the drivable road; it is dressed for 100 m more at both ends.
+        traffic: density of the vehicles in the lanes, as a factor.
     """
     style, ground, warp = draw_world(kind, seed)
+    style = style._replace(traffic_gap=style.traffic_gap / traffic)
     first = int(np.floor(-MARGIN_M / roadside.CHUNK_M))
     last = int(np.ceil((length_m + MARGIN_M) / roadside.CHUNK_M))
     chunks = [make_chunk(style, seed, index) for index in range(first, last)]

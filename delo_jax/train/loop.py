@@ -5,7 +5,7 @@ import logging
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,8 @@ from delo_jax.config import TrainConfig
 from delo_jax.errors import ConfigError
 from delo_jax.model import delo
 from delo_jax.train.pairs import make_batch
-from delo_jax.train.step import PairBatch, TrainState, make_optimizer, make_train_step
+from delo_jax.train.recorded import count_recorded, recorded_worlds
+from delo_jax.train.step import PairBatch, TrainState, make_optimizer, make_train_step, start
 from delo_jax.train.validate import GapErrors, validate
 from delo_jax.train.worlds import World, worlds
 
@@ -37,71 +38,130 @@ class Reporter(Protocol):
         """Errors on unseen worlds after `step` steps."""
 
 
-def phases(cfg: TrainConfig) -> list[tuple[TrainConfig, int]]:
-    """(weights of the losses, number of steps): first matching and pose, then the evidence of the finished solver.
+def phases(cfg: TrainConfig, num_pose_steps: int) -> list[tuple[TrainConfig, int]]:
+    """(weights of the losses, number of steps): matching and pose, then the evidence of the finished solver.
 
-    A phase whose weights are all 0 has no steps.
+    With `num_evidence_steps` 0 there is one phase, and evidence is learned together with the pose. A phase whose
+    weights are all 0 has no steps.
     """
+    solver_weight = cfg.matching_weight + cfg.fine_weight + cfg.odometry_weight
+    if cfg.num_evidence_steps == 0:
+        return [(cfg, num_pose_steps if solver_weight + cfg.evidence_weight > 0 else 0)]
     pose = dataclasses.replace(cfg, evidence_weight=0.0)
-    evidence = dataclasses.replace(cfg, coarse_weight=0.0, fine_weight=0.0)
-    num_pose_steps = cfg.num_steps if cfg.coarse_weight + cfg.fine_weight > 0 else 0
-    return [(pose, num_pose_steps), (evidence, cfg.num_evidence_steps if cfg.evidence_weight > 0 else 0)]
+    evidence = dataclasses.replace(cfg, matching_weight=0.0, fine_weight=0.0, odometry_weight=0.0)
+    return [(pose, num_pose_steps if solver_weight > 0 else 0), (evidence, cfg.num_evidence_steps if cfg.evidence_weight > 0 else 0)]
 
 
-def train(cfg: TrainConfig, out: Path, reporter: Reporter) -> tuple[delo.Model, list[GapErrors]]:
+def count_steps(cfg: TrainConfig, training: list[World]) -> int:
+    """Steps of matching and pose: `num_steps`, or those of `num_epochs` passes over all frames that have a successor."""
+    if not cfg.num_epochs:
+        return cfg.num_steps
+    num_pairs = sum(len(world.Ts_world_lidar) - 1 for world in training)
+    return cfg.num_epochs * max(num_pairs // cfg.batch_size, 1)
+
+
+def train(cfg: TrainConfig, out: Path, reporter: Reporter, data: Path | None = None) -> tuple[delo.Model, list[GapErrors], int]:
     """Train a model; a run that was interrupted goes on from its last checkpoint.
 
     Args:
         cfg: the run.
         out: folder for worlds and checkpoints.
         reporter: progress.
+        data: a KITTI odometry tree with the sequences of `cfg.recorded`; None where that is empty.
 
     Returns:
-        The model and its errors on the validation worlds.
+        The model, its errors on the validation worlds, and the number of steps left out because they were not finite.
     """
+    mesh = _mesh(cfg)
+    _check_data(cfg, data)
+    with Checkpoints(out / "checkpoints", cfg) as checkpoints:
+        training, held_out = load_worlds(cfg, out / "worlds", reporter, data)
+        model, num_nonfinite = _fit(cfg, training, held_out, delo.init(cfg.model, jax.random.key(cfg.seed)), mesh, checkpoints, reporter)
+    return model, validate(model, held_out), num_nonfinite
+
+
+def fit(cfg: TrainConfig, training: list[World], held_out: list[World], start_from: delo.Model, out: Path, reporter: Reporter):
+    """The same on worlds at hand, from given weights, without the validation at the end; returns model and steps left out."""
+    with Checkpoints(out / "checkpoints", cfg) as checkpoints:
+        return _fit(cfg, training, held_out, start_from, _mesh(cfg), checkpoints, reporter)
+
+
+def _mesh(cfg: TrainConfig) -> Mesh:
+    """All local devices, over which the batch is spread."""
     mesh = jax.make_mesh((jax.local_device_count(),), ("batch",), axis_types=(jax.sharding.AxisType.Auto,))
     if cfg.batch_size % mesh.size:
         raise ConfigError(f"batch_size: expected a multiple of the {mesh.size} local devices, got {cfg.batch_size}")
-    with Checkpoints(out / "checkpoints", cfg) as checkpoints:
-        reporter.start("simulating training worlds", cfg.num_scenes)
-        training = list(worlds(cfg, out / "worlds", validation=False, on_world=reporter.advance))
-        reporter.start("simulating validation worlds", cfg.num_validation_scenes)
-        held_out = list(worlds(cfg, out / "worlds", validation=True, on_world=reporter.advance))
-        params = delo.init(cfg.model, jax.random.key(cfg.seed)).variables
-        first = 0
-        for phase_cfg, num_steps in phases(cfg):
-            if num_steps:
-                params = _run_phase(phase_cfg, num_steps, first, params, training, held_out, mesh, checkpoints, reporter)
-            first += num_steps
-    model = delo.Model(jax.device_get(params), cfg.model)
-    return model, validate(model, held_out)
+    return mesh
 
 
-def _run_phase(cfg, num_steps, first, params, training, held_out, mesh, checkpoints, reporter) -> Any:
-    """Steps `first` to `first + num_steps` with a fresh optimiser; returns the params."""
-    tx = make_optimizer(cfg, num_steps)
+def _fit(cfg, training, held_out, start_from, mesh, checkpoints, reporter) -> tuple[delo.Model, int]:
+    """All phases; returns the model and the number of steps left out."""
+    variables, first, num_nonfinite = start_from.variables, 0, 0
+    for phase_cfg, num_steps in phases(cfg, count_steps(cfg, training)):
+        if num_steps:
+            counts = first, num_nonfinite
+            state = _run_phase(phase_cfg, num_steps, counts, variables, training, held_out, mesh, checkpoints, reporter)
+            variables, num_nonfinite = state.variables, int(state.num_nonfinite)
+        first += num_steps
+    if num_nonfinite:
+        log.warning("%d of %d steps were left out: loss or gradient was not finite", num_nonfinite, first)
+    return delo.Model(jax.device_get(variables), cfg.model), num_nonfinite
+
+
+def _check_data(cfg: TrainConfig, data: Path | None) -> None:
+    """Raise where the sequences and their tree do not fit, before anything is written."""
+    if bool(cfg.recorded.split()) != (data is not None):
+        raise ConfigError("recorded: expected sequence names exactly when there is a tree of recorded data; give both or neither")
+    if data is not None:
+        count_recorded(data, cfg.recorded.split(), validation=False)
+
+
+def load_worlds(cfg: TrainConfig, folder: Path, reporter: Reporter, data: Path | None) -> tuple[list[World], list[World]]:
+    """Training and validation worlds, simulated or recorded."""
+    names, both = cfg.recorded.split(), []
+    for validation, what in ((False, "training"), (True, "validation")):
+        if data is not None:
+            reporter.start(f"reading {what} scans", count_recorded(data, names, validation=validation))
+            found = recorded_worlds(data, names, cfg.model.preprocess, folder, validation=validation, on_world=reporter.advance)
+        else:
+            reporter.start(f"simulating {what} worlds", cfg.num_validation_scenes if validation else cfg.num_scenes)
+            found = worlds(cfg, folder, validation=validation, on_world=reporter.advance)
+        both.append(list(found))
+    return both[0], both[1]
+
+
+def _run_phase(cfg, num_steps, counts, variables, training, held_out, mesh, checkpoints, reporter) -> TrainState:
+    """`num_steps` steps with a fresh optimiser; returns the last state. `counts`: steps before, and how many were left out."""
+    tx, first = make_optimizer(cfg, num_steps), counts[0]
     train_step = make_train_step(cfg, tx)
-    state = TrainState(params, tx.init(params), jnp.asarray(first, jnp.int32))
-    state = checkpoints.restore(state, first, first + num_steps)
+    state = checkpoints.restore(start(variables, tx, *counts), first, first + num_steps)
     done = int(state.step)
     state = jax.device_put(state, NamedSharding(mesh, PartitionSpec()))
-    reporter.start("learning evidence" if cfg.evidence_weight else "learning poses", num_steps, done - first)
+    solver_weight = cfg.matching_weight + cfg.fine_weight + cfg.odometry_weight
+    reporter.start("learning poses" if solver_weight else "learning evidence", num_steps, done - first)
     try:
         for batch in _batches(cfg, training, mesh, done, first + num_steps):
             state, metrics = train_step(state, batch)
             done += 1
-            loss = float(metrics["loss"])
-            if not np.isfinite(loss):
-                raise ConfigError(f"step {done}: expected a finite loss, got {loss}; lower learning_rate")
-            reporter.advance(f"loss {loss:.3f}")
+            num_nonfinite = int(state.num_nonfinite)
+            _check_health(done, num_nonfinite)
+            reporter.advance(f"loss {float(metrics['loss']):.3f}" + (f", {num_nonfinite} not finite" if num_nonfinite else ""))
             if done % cfg.validate_every == 0 or done == first + num_steps:
                 checkpoints.save(done, state)
-                reporter.validated(done, validate(delo.Model(state.params, cfg.model), held_out))
+                if held_out:
+                    reporter.validated(done, validate(delo.Model(state.variables, cfg.model), held_out))
     except KeyboardInterrupt:
         if not any(leaf.is_deleted() for leaf in jax.tree.leaves(state)):  # else it came within a step, which had taken the old state
             checkpoints.save(int(state.step), state)
         raise
-    return state.params
+    return state
+
+
+def _check_health(step: int, num_nonfinite: int) -> None:
+    """Raise once more than a tenth of the steps, and more than ten, were not finite."""
+    if num_nonfinite > max(10, step // 10):
+        what = f"{num_nonfinite} of {step} with a loss or gradient that is not finite"
+        raise ConfigError(f"step {step}: expected finite steps, got {what}; lower learning_rate")
 
 
 def _batches(cfg: TrainConfig, training: list[World], mesh: Mesh, start: int, stop: int) -> Iterator[PairBatch]:
@@ -109,7 +169,8 @@ def _batches(cfg: TrainConfig, training: list[World], mesh: Mesh, start: int, st
     sharding = NamedSharding(mesh, PartitionSpec("batch"))
 
     def make(step: int) -> PairBatch:
-        batch = make_batch(training, cfg.batch_size, np.random.default_rng((cfg.seed, step)), evidence=cfg.evidence_weight > 0)
+        with_failures = cfg.evidence_weight > 0 and cfg.model.evidence.head == "statistics"
+        batch = make_batch(training, cfg, np.random.default_rng((cfg.seed, step)), evidence=with_failures)
         return jax.device_put(batch, sharding)
 
     with ThreadPoolExecutor(1) as pool:
@@ -156,5 +217,5 @@ class Checkpoints:
         stored = self._manager.restore(latest, args=self._ocp.args.StandardRestore(jax.device_get(state)))
         stored = TrainState(*stored) if not isinstance(stored, TrainState) else stored
         if latest > last:  # this phase is over
-            return TrainState(stored.params, state.opt_state, jnp.asarray(last, jnp.int32))
+            return TrainState(stored.variables, state.opt_state, jnp.asarray(last, jnp.int32), stored.num_nonfinite)
         return jax.tree.map(jnp.asarray, stored)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from delo_jax.config import TrainConfig
 from delo_jax.geometry import se3
 from delo_jax.preprocess import Scan
 from delo_jax.train.step import PairBatch
@@ -14,6 +15,15 @@ def _rotation_z(angle: float) -> np.ndarray:
     return se3.exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))
 
 
+def _drawn(scan: Scan, num_points: int, rng: np.random.Generator) -> Scan:
+    """Another draw of a raw scan: that many of its points, without replacement."""
+    order = rng.permutation(int(scan.mask.sum()))[:num_points]
+    mask = np.arange(num_points) < len(order)
+    points = np.zeros((num_points, 3), np.float32)
+    points[: len(order)] = scan.points[order]
+    return scan._replace(points=points, mask=mask, keypoint_index=np.arange(num_points, dtype=np.int32), keypoint_mask=mask)
+
+
 def _augment(scan: Scan, T: np.ndarray, mirror: bool, drop: float, rng: np.random.Generator) -> Scan:
     """The scan seen from a turned (and mirrored) sensor, rows reshuffled, some points dropped."""
     linear = T[:3, :3] @ np.diag([1.0, -1.0 if mirror else 1.0, 1.0])
@@ -23,11 +33,12 @@ def _augment(scan: Scan, T: np.ndarray, mirror: bool, drop: float, rng: np.rando
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     mask = np.arange(len(order)) < keep.sum()
-    index = rank[scan.keypoint_index].astype(np.int32)
+    raw = len(scan.normals) == 0
+    index = scan.keypoint_index if raw else rank[scan.keypoint_index].astype(np.int32)
     return Scan(
         (scan.points[order] @ linear.T).astype(np.float32),
-        (scan.normals[order] @ linear.T).astype(np.float32),
-        scan.features[order],
+        scan.normals if raw else (scan.normals[order] @ linear.T).astype(np.float32),
+        scan.features if raw else scan.features[order],
         mask,
         index,
         scan.keypoint_mask & mask[index],
@@ -45,16 +56,36 @@ def _start(T_true: np.ndarray, T_identity: np.ndarray, kind: int, rng: np.random
     return T_true @ se3.exp(xi)
 
 
-def random_pair(world: World, rng: np.random.Generator, *, evidence: bool = False) -> PairBatch:
-    """One augmented pair (no batch axis) of two different frames of a world, in either order.
+def random_frames(num_frames: int, cfg: TrainConfig, rng: np.random.Generator) -> tuple[int, int]:
+    """Frames of source and target, any two that are at most `max_gap` apart; the source is earlier unless pairs are augmented."""
+    gaps = np.arange(1, min(cfg.max_gap, num_frames - 1) + 1)
+    gap = int(rng.choice(gaps, p=(num_frames - gaps) / (num_frames - gaps).sum()))
+    first = int(rng.integers(num_frames - gap))
+    return (first + gap, first) if cfg.augment and rng.random() < 0.5 else (first, first + gap)
+
+
+def random_pair(world: World, cfg: TrainConfig, rng: np.random.Generator, *, evidence: bool = False) -> PairBatch:
+    """One pair (no batch axis) of two frames of a world.
 
     Args:
         world: scans and poses.
+        cfg: largest gap, whether to augment, and the number of points of raw scans.
         rng: randomness.
-        evidence: for the evidence head, which has to see failures: the start is mostly the identity however far the
+        evidence: for the evidence head that has to see failures: the start is mostly the identity however far the
             truth is, and some pairs have lost most of their points.
     """
-    source, target = rng.choice(len(world.Ts_world_lidar), 2, replace=False)
+    frames = random_frames(len(world.Ts_world_lidar), cfg, rng)
+    scans = [Scan(*(array[frame] for array in world.scans)) for frame in frames]
+    if cfg.model.preprocess.sampling == "raw":
+        scans = [_drawn(scan, cfg.model.preprocess.max_points, rng) for scan in scans]
+    T = se3.inverse(world.Ts_world_lidar[frames[1]]) @ world.Ts_world_lidar[frames[0]]
+    if not cfg.augment:
+        return PairBatch(scans[0], scans[1], T.astype(np.float32), np.eye(4, dtype=np.float32), np.array(True))
+    return _augmented(scans, T, rng, evidence=evidence)
+
+
+def _augmented(scans: list[Scan], T: np.ndarray, rng: np.random.Generator, *, evidence: bool) -> PairBatch:
+    """The pair seen from turned, mirrored sensors, some points dropped, with a start for the fine stage."""
     mirror, drop = rng.random() < 0.5, rng.choice([0.0, 0.0, 0.3])
     if evidence and rng.random() < 0.2:
         drop = rng.uniform(0.5, 0.97)
@@ -62,31 +93,31 @@ def random_pair(world: World, rng: np.random.Generator, *, evidence: bool = Fals
     relative = rng.normal() * np.radians(8.0) if rng.random() < 0.5 else 0.0
     A_source, A_target = _rotation_z(yaw), _rotation_z(yaw + relative)
     M = np.diag([1.0, -1.0 if mirror else 1.0, 1.0, 1.0])
-    T = M @ se3.inverse(world.Ts_world_lidar[target]) @ world.Ts_world_lidar[source] @ M
-    T_true = A_target @ T @ se3.inverse(A_source)
+    T_true = A_target @ (M @ T @ M) @ se3.inverse(A_source)
     T_identity = A_target @ se3.inverse(A_source)
     T_init = T_identity if evidence and rng.random() < 0.7 else _start(T_true, T_identity, int(rng.integers(2)), rng)
-    scans = [
-        _augment(Scan(*(array[frame] for array in world.scans)), A, mirror, drop, rng)
-        for frame, A in ((source, A_source), (target, A_target))
-    ]
-    return PairBatch(scans[0], scans[1], T_true.astype(np.float32), T_init.astype(np.float32), np.array(rng.random() < 1 / 3))
+    source, target = (_augment(scan, A, mirror, drop, rng) for scan, A in zip(scans, (A_source, A_target), strict=True))
+    return PairBatch(source, target, T_true.astype(np.float32), T_init.astype(np.float32), np.array(rng.random() < 1 / 3))
 
 
-def unrelated_pair(first: World, second: World, rng: np.random.Generator) -> PairBatch:
+def unrelated_pair(first: World, second: World, cfg: TrainConfig, rng: np.random.Generator) -> PairBatch:
     """Scans of two different worlds: no pose is right, so the truth is drawn at random, metres and tens of degrees away."""
-    a, b = random_pair(first, rng, evidence=True), random_pair(second, rng, evidence=True)
+    a, b = random_pair(first, cfg, rng, evidence=True), random_pair(second, cfg, rng, evidence=True)
     error = se3.exp(rng.normal(size=6) * np.repeat([np.radians(20.0), 5.0], 3))
     return a._replace(target=b.target, T_target_source=(a.T_init @ error).astype(np.float32))
 
 
-def make_batch(worlds: list[World], size: int, rng: np.random.Generator, *, evidence: bool = False) -> PairBatch:
-    """`size` random pairs of random worlds, stacked; for the evidence head one pair in eight is of two different worlds."""
+def make_batch(worlds: list[World], cfg: TrainConfig, rng: np.random.Generator, *, evidence: bool = False) -> PairBatch:
+    """Random pairs of random worlds, stacked; with `evidence` one pair in eight is of two different worlds.
+
+    Longer worlds give more pairs: each is drawn as often as it has frames.
+    """
+    lengths = np.array([len(world.Ts_world_lidar) for world in worlds], float)
     pairs = []
-    for _ in range(size):
-        first, second = (worlds[index] for index in rng.integers(len(worlds), size=2))
+    for _ in range(cfg.batch_size):
+        first, second = (worlds[index] for index in rng.choice(len(worlds), size=2, p=lengths / lengths.sum()))
         wrong = evidence and first is not second and rng.random() < 0.125
-        pairs.append(unrelated_pair(first, second, rng) if wrong else random_pair(first, rng, evidence=evidence))
+        pairs.append(unrelated_pair(first, second, cfg, rng) if wrong else random_pair(first, cfg, rng, evidence=evidence))
     sources, targets, *rest = zip(*pairs, strict=True)
     stack = [Scan(*(np.stack(arrays) for arrays in zip(*scans, strict=True))) for scans in (sources, targets)]
     return PairBatch(*stack, *(np.stack(arrays) for arrays in rest))

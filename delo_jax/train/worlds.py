@@ -5,7 +5,7 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from delo_jax.sim import KINDS, simulate_clip
 SIMULATOR = 1  # counts the changes of `delo_jax.sim` that change a world; stored worlds of another are not used
 VALIDATION_SEED = 1_000_000  # of the first held-out world
 SEEDS_PER_RUN = 2_000_000  # so that runs of different seeds share no world
+RAW_RESERVE = 4  # raw scans keep so many times the points of one input, of which training draws anew each time
 SENSORS = ("hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl32e", "os1-128")
 
 
@@ -26,6 +27,23 @@ class World(NamedTuple):
 
     scans: Scan  # arrays with a leading frame axis
     Ts_world_lidar: np.ndarray  # (f, 4, 4) float64
+
+
+def scan_of(world: World, frame: int, cfg: PreprocessConfig) -> Scan:
+    """One scan of a world as inference sees it: the first points of its row order, as many as one input takes."""
+    scan = Scan(*(array[frame] for array in world.scans))
+    if cfg.sampling != "raw":
+        return scan
+    points, mask = scan.points[: cfg.max_points], scan.mask[: cfg.max_points]
+    return scan._replace(points=points, mask=mask, keypoint_index=scan.keypoint_index[: cfg.max_points], keypoint_mask=mask)
+
+
+def stored_config(cfg: PreprocessConfig) -> PreprocessConfig:
+    """Preprocessing of the scans in a store; raw scans keep more points than one input takes."""
+    if cfg.sampling != "raw":
+        return cfg
+    num = RAW_RESERVE * cfg.max_points
+    return replace(cfg, max_points=num, num_keypoints=num)
 
 
 def make_world(index: int, *, seed: int, num_frames: int, cfg: PreprocessConfig) -> World:
@@ -41,7 +59,7 @@ def make_world(index: int, *, seed: int, num_frames: int, cfg: PreprocessConfig)
     sensor = SENSORS[(index // len(KINDS)) % len(SENSORS)]
     clip = simulate_clip(kind, seed + index, num_frames=num_frames, sensor=sensor)
     with ThreadPoolExecutor(2) as pool:
-        scans = list(pool.map(lambda scan: preprocess(scan.points, cfg), clip))
+        scans = list(pool.map(lambda scan: preprocess(scan.points, stored_config(cfg)), clip))
     stacked = Scan(*(np.stack(arrays) for arrays in zip(*scans, strict=True)))
     return World(stacked, np.stack([scan.T_world_lidar for scan in clip]))
 
@@ -62,17 +80,18 @@ def worlds(cfg: TrainConfig, folder: Path, *, validation: bool, on_world: Callab
         path = folder / f"{name}_{fingerprint}_{index:05d}.npz"
         if not path.exists():
             world = make_world(index, seed=seed + cfg.seed * SEEDS_PER_RUN, num_frames=cfg.num_frames, cfg=cfg.model.preprocess)
-            _write(path, world)
-        yield _read(path)
+            write_world(path, world)
+        yield read_world(path)
         on_world()
 
 
 def _fingerprint(cfg: TrainConfig) -> str:
-    text = json.dumps([SIMULATOR, asdict(cfg.model.preprocess), cfg.num_frames, cfg.seed])
+    text = json.dumps([SIMULATOR, asdict(stored_config(cfg.model.preprocess)), cfg.num_frames, cfg.seed])
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
-def _write(path: Path, world: World) -> None:
+def write_world(path: Path, world: World) -> None:
+    """Store a world; a file that is there is whole."""
     part = path.with_suffix(".part")
     halves = {name: array.astype(np.float16) if name in ("normals", "features") else array for name, array in world.scans._asdict().items()}
     with part.open("wb") as file:
@@ -80,7 +99,8 @@ def _write(path: Path, world: World) -> None:
     os.replace(part, path)
 
 
-def _read(path: Path) -> World:
+def read_world(path: Path) -> World:
+    """A stored world."""
     with np.load(path) as stored:
         arrays = {name: stored[name] for name in stored.files}
     Ts = arrays.pop("Ts_world_lidar")

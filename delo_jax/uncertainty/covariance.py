@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from delo_jax.config import StatusConfig
+from delo_jax.geometry import se3
 from delo_jax.uncertainty.observability import Observability
 
 
@@ -31,6 +32,31 @@ def from_evidence(gamma: np.ndarray, nu: np.ndarray, alpha: np.ndarray, beta: np
     aleatoric = beta / (alpha - 1.0)
     epistemic = aleatoric / nu
     return Uncertainty(aleatoric, epistemic, np.diag(aleatoric + epistemic) + np.outer(gamma, gamma))
+
+
+def from_pose6_evidence(T: np.ndarray, gamma: np.ndarray, nu: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> Uncertainty:
+    """Moments of a normal-inverse-gamma prediction of the true pose's `pose6`, not calibrated, as those of a right perturbation of T.
+
+    To first order, by the Jacobian J of `pose6` at T. As in `from_evidence` the pose is not moved: the covariance is the second moment
+    about T, so what the prediction disagrees with T by, e = gamma - pose6(T), adds J e e^T J^T.
+
+    Args:
+        T: (4, 4) the pose.
+        gamma: (6,) expected [roll, pitch, yaw, x, y, z] of the truth [rad, m]; angles of any turn.
+        nu: (6,) virtual observations of the mean.
+        alpha: (6,) shape of the variance, above 1.
+        beta: (6,) scale of the variance [rad^2, m^2].
+    """
+    pose = se3.pose6(np.asarray(T, np.float64))
+    J = se3.pose6_jacobian(pose)
+    aleatoric = beta / (alpha - 1.0)
+    epistemic = aleatoric / nu
+    error = np.asarray(gamma, np.float64) - pose
+    error[:3] = np.pi - (np.pi - error[:3]) % (2 * np.pi)  # the short way round
+    moved = J @ error
+    half = J * np.sqrt(aleatoric + epistemic)
+    covariance = half @ half.T + np.outer(moved, moved)  # symmetric to the last bit
+    return Uncertainty(J**2 @ aleatoric, J**2 @ epistemic, covariance)
 
 
 def unknown(cfg: StatusConfig) -> Uncertainty:

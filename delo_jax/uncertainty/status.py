@@ -20,7 +20,7 @@ def judge(
     *,
     num_points: tuple[int, int],
     finite: bool,
-    confidence: float,
+    confidence: float | None,
     seen: Observability,
     cfg: StatusConfig,
 ) -> Health:
@@ -29,7 +29,7 @@ def judge(
     Args:
         num_points: usable points of source and target.
         finite: whether the solver returned numbers.
-        confidence: probability that the pair is not lost.
+        confidence: probability that the pair is not lost; None where the network says nothing of it, which is never `ok`.
         seen: how well the surfaces hold each direction.
         cfg: thresholds.
     """
@@ -38,12 +38,15 @@ def judge(
         return Health("rejected", f"{which} has {min(num_points)} usable points, fewer than {cfg.min_points}", 0.0)
     if not finite:
         return Health("rejected", "the solver returned no finite pose", 0.0)
-    if confidence < cfg.rejected_confidence:
+    known = 0.0 if confidence is None else confidence
+    if confidence is not None and confidence < cfg.rejected_confidence:
         return Health("rejected", f"confidence {confidence:.2f} is below {cfg.rejected_confidence:g}", confidence)
     if seen.shares[0] < cfg.min_observability:
         axes = ", ".join(seen.unheld_axes(cfg.min_observability))
         reason = f"hardly any surface holds {axes} ({max(seen.shares[0], 0.0):.5f} is below {cfg.min_observability:g})"
-        return Health("degenerate", reason, confidence)
+        return Health("degenerate", reason, known)
+    if confidence is None:
+        return Health("low_confidence", "this network has no evidence head: nothing says how far its pose can be trusted", 0.0)
     if confidence < cfg.ok_confidence:
         return Health("low_confidence", f"confidence {confidence:.2f} is below {cfg.ok_confidence:g}", confidence)
     return Health("ok", "", confidence)

@@ -110,12 +110,13 @@ def test_train(cli, monkeypatch, tmp_path, weights_file):
     """Oracle: a training that is told by hand: bars, tables, card and weights are those of its answer."""
     errors = [GapErrors(1, 40, 1.5, 4.5, 0.02, 0.025, 0.0, 0.0)]
 
-    def learn(cfg, out, reporter):
+    def learn(cfg, out, reporter, data):
+        assert data is None
         reporter.start("learning poses", 2)
         reporter.advance("loss 1.000")
         reporter.validated(1, errors)
         reporter.advance("loss 0.500")
-        return weights.load(weights_file), errors
+        return weights.load(weights_file), errors, 3
 
     monkeypatch.setitem(sys.modules, "delo_jax.train.loop", SimpleNamespace(train=learn))
     done = cli("train", "base", "--out", tmp_path)
@@ -125,6 +126,7 @@ def test_train(cli, monkeypatch, tmp_path, weights_file):
     card = weights.read_card(tmp_path / "delo-base.safetensors")
     assert card["license"] == "MIT"
     assert card["metrics"][0]["lost_share"] == 0.025
+    assert card["steps left out as not finite"] == 3
     assert card["commands"] == [f"delo train base --out {tmp_path}"]
     assert card["seeds"] == {"base": 0, "validation": "worlds from seed 1000000 on, never trained on"}
     weights.load(tmp_path / "delo-base.safetensors")
@@ -133,7 +135,7 @@ def test_train(cli, monkeypatch, tmp_path, weights_file):
 def test_train_interrupted_says_how_to_go_on(cli, monkeypatch, tmp_path):
     """Oracle: the same command line."""
 
-    def interrupt(cfg, out, reporter):
+    def interrupt(cfg, out, reporter, data):
         raise KeyboardInterrupt
 
     monkeypatch.setitem(sys.modules, "delo_jax.train.loop", SimpleNamespace(train=interrupt))

@@ -148,6 +148,39 @@ def test_pose6_is_intrinsic_xyz(seed):
     np.testing.assert_allclose(se3.from_pose6(pose), T, atol=1e-13)
 
 
+POSES6 = [
+    np.zeros(6),
+    np.array([0.1, -0.2, 0.3, 4.0, 5.0, -6.0]),
+    np.array([-2.9, 1.4, 3.1, -20.0, 1.0, 0.5]),
+    np.array([0.0, np.pi / 2, 0.7, 1.0, 2.0, 3.0]),
+]
+
+
+@pytest.mark.parametrize("pose", POSES6)
+def test_jacobian_of_pose6_is_the_slope(pose):
+    """Oracle: central differences of scipy Rotation's intrinsic XYZ and gtsam's Logmap; half turns and a pitch of 90 deg included."""
+
+    def T(pose):
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = Rotation.from_euler("XYZ", pose[:3]).as_matrix(), pose[3:]
+        return matrix
+
+    expected = numeric_jacobian(lambda moved: gtsam.Pose3.Logmap(gtsam.Pose3(np.linalg.inv(T(pose)) @ T(moved))), pose, step=1e-5)
+    found = se3.pose6_jacobian(pose)
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+def test_jacobian_of_pose6_under_jit_and_vmap():
+    """Oracle: the same function, one pose at a time, not compiled; its gradient by central differences; NumPy, tested above."""
+    poses = np.array(POSES6)
+    assert_transforms_agree(se3.pose6_jacobian, jnp.asarray(poses, jnp.float32))
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(se3.pose6_jacobian(jnp.asarray(poses[2])), se3.pose6_jacobian(poses[2]), atol=1e-14)
+        probe = jnp.arange(36.0).reshape(6, 6)
+        assert_gradient_is_the_slope(lambda pose: jnp.sum(probe * se3.pose6_jacobian(pose)), [poses[1]])
+
+
 def test_covariances_follow_the_chain_rule():
     """Oracle: central differences of gtsam's compose, inverse and Logmap; right perturbations."""
     rng = np.random.default_rng(0)

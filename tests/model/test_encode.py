@@ -86,8 +86,8 @@ def test_descriptors_match_a_loop_in_float64():
     params = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), model.variables["params"]["encoder"])
     kept = scan.keypoint_index[:30]
     points, features = scan.points[kept].astype(np.float64), np.hstack([scan.normals[kept], scan.features[kept]]).astype(np.float64)
-    neighbors = [np.argsort(np.linalg.norm(points - p, axis=1))[: TINY.coarse.num_neighbors] for p in points]
-    index = np.asarray(knn(jnp.asarray(scan.points[kept]), jnp.ones(30, bool), TINY.coarse.num_neighbors))
+    neighbors = [np.argsort(np.linalg.norm(points - p, axis=1))[: TINY.encoder.num_neighbors] for p in points]
+    index = np.asarray(knn(jnp.asarray(scan.points[kept]), jnp.ones(30, bool), TINY.encoder.num_neighbors))
     assert [set(row) for row in index] == [set(row) for row in neighbors]
     levels = [features]
     for level in range(3):

@@ -122,7 +122,7 @@ def test_evidence_is_in_the_units_of_the_config():
     statistics = jnp.linspace(-1, 1, NUM_STATISTICS)
     raw, expected_logit = tiny_model().apply("evidence", statistics)
     raw = evidence.constrain(raw)
-    nig, logit = delo.predict_evidence(tiny_model(), statistics)
+    nig, logit = delo.evidence_of_statistics(tiny_model(), statistics)
     assert logit == expected_logit
     unit = np.array([1e-3] * 3 + [1e-2] * 3)
     np.testing.assert_allclose(nig.gamma, raw.gamma * unit, rtol=1e-6)

@@ -1,9 +1,12 @@
 """The Normal-Inverse-Gamma head."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.stats
 
 from delo_jax.ops.evidence import NIG, constrain, moments, negative_log_likelihood, regulariser
@@ -55,22 +58,23 @@ def test_regulariser():
     np.testing.assert_allclose(regulariser(nig, jnp.full(6, 2.0)), np.full(6, 15.0))
 
 
-@jax.jit
-def check_up(raw):
+@functools.partial(jax.jit, static_argnames="log_beta")
+def check_up(raw, log_beta):
     """Distribution, a scalar that uses everything, and its gradient."""
 
     def loss(raw):
-        nig = constrain(raw)
+        nig = constrain(raw, log_beta=log_beta)
         variances = moments(nig)
         return jnp.sum(negative_log_likelihood(nig, nig.gamma + 1e-3)) + 1e-9 * jnp.sum(variances.aleatoric + variances.epistemic)
 
-    return constrain(raw), *jax.value_and_grad(loss)(raw)
+    return constrain(raw, log_beta=log_beta), *jax.value_and_grad(loss)(raw)
 
 
 @pytest.mark.parametrize("raw", [-1e4, -30.0, 0.0, 30.0, 1e4])
-def test_any_raw_number_is_a_valid_distribution(raw):
+@pytest.mark.parametrize("log_beta", [True, False])
+def test_any_raw_number_is_a_valid_distribution(raw, log_beta):
     """Oracle: the ranges of the distribution, finite moments, likelihood and gradient in float32."""
-    nig, value, gradient = check_up(jnp.full((2, 24), raw))
+    nig, value, gradient = check_up(jnp.full((2, 24), raw), log_beta)
     assert nig.beta.shape == (2, 6)
     assert all(np.all(field > bound) for field, bound in ((nig.nu, 0), (nig.alpha, 1), (nig.beta, 0)))
     assert np.isfinite(value)
@@ -86,13 +90,55 @@ def test_raw_numbers_keep_their_order():
     np.testing.assert_allclose(nig.beta, np.full(6, np.exp(4.0)), rtol=1e-5)
 
 
-def test_gradients_are_the_slopes():
+@pytest.mark.parametrize("log_beta", [True, False])
+def test_constraints_follow_their_formulas(log_beta):
+    """Oracle: NumPy, log1p(exp) for nu and alpha, exp or log1p(exp) for beta, with the floors."""
+    raw = np.random.default_rng(0).uniform(-20, 8, size=(5, 24))
+    gamma, nu, alpha, beta = np.split(raw, 4, axis=1)
+    expected = NIG(
+        gamma=gamma,
+        nu=np.log1p(np.exp(nu)) + 1e-3,
+        alpha=np.log1p(np.exp(alpha)) + 1 + 1e-3,
+        beta=np.exp(beta) if log_beta else np.log1p(np.exp(beta)) + 1e-6,
+    )
+    with jax.enable_x64(True):
+        found = constrain(jnp.asarray(raw), log_beta=log_beta)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-9), found, expected)
+
+
+def test_softplus_beta_has_a_floor():
+    """Oracle: softplus(-200) is zero in float32; the floor keeps the log of beta and both variances finite and positive."""
+    nig = constrain(jnp.full(24, -200.0), log_beta=False)
+    np.testing.assert_allclose(nig.beta, np.full(6, 1e-6), rtol=1e-6)
+    np.testing.assert_allclose(moments(nig).aleatoric, np.full(6, 1e-3), rtol=1e-3)
+    assert np.all(np.isfinite(negative_log_likelihood(nig, nig.gamma)))
+
+
+@pytest.mark.parametrize(("nu", "alpha", "beta"), [(2.0, 4.0, 0.5), (0.1, 1.5, 3.0)])
+def test_density_integrates_to_one(nu, alpha, beta):
+    """Oracle: scipy quad; exp(-negative log likelihood) is a density over the observation."""
+    with jax.enable_x64(True):
+        nig = NIG(*(jnp.full(6, value) for value in (0.3, nu, alpha, beta)))
+        density = jax.jit(lambda y: jnp.exp(-negative_log_likelihood(nig, jnp.full(6, y))[0]))
+        assert scipy.integrate.quad(lambda y: float(density(y)), -np.inf, np.inf)[0] == pytest.approx(1, abs=1e-6)
+
+
+def test_regulariser_weighs_nu_twice():
+    """Oracle: slopes by hand; twice as steep in nu as in alpha (the paper prints it the other way round)."""
+    nig = NIG(*(jnp.full(6, value) for value in (0.5, 3.0, 4.0, 1.0)))
+    slopes = jax.grad(lambda nig: jnp.sum(regulariser(nig, jnp.full(6, 2.5))))(nig)
+    np.testing.assert_allclose(slopes.nu, np.full(6, 4.0))
+    np.testing.assert_allclose(slopes.alpha, np.full(6, 2.0))
+
+
+@pytest.mark.parametrize("log_beta", [True, False])
+def test_gradients_are_the_slopes(log_beta):
     """Oracle: central differences in x64."""
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
 
         def loss(raw, observation):
-            nig = constrain(raw)
+            nig = constrain(raw, log_beta=log_beta)
             likelihood = negative_log_likelihood(nig, observation) + 0.1 * regulariser(nig, observation)
             return jnp.sum(likelihood) + jnp.sum(sum(moments(nig)))
 
@@ -106,6 +152,6 @@ def test_evidence_under_jit_and_vmap():
 
     def everything(raw, y):
         nig = constrain(raw)
-        return nig, moments(nig), negative_log_likelihood(nig, y), regulariser(nig, y)
+        return constrain(raw, log_beta=False), nig, moments(nig), negative_log_likelihood(nig, y), regulariser(nig, y)
 
     assert_transforms_agree(everything, raw, observation)

@@ -67,13 +67,59 @@ def test_nearest_stores_no_coordinate_differences():
     assert memory.temp_size_in_bytes < 1.5 * n * m * 4
 
 
-def test_knn_by_distance():
-    """Oracle: cKDTree, by distance; the first neighbour is the point itself."""
-    points, k = cloud(0, 200), 12
-    index = np.asarray(knn(points, jnp.ones(200, bool), k))
-    np.testing.assert_array_equal(index[:, 0], np.arange(200))
-    host = np.asarray(points, np.float64)
-    np.testing.assert_allclose(np.linalg.norm(host[index] - host[:, None], axis=2), cKDTree(host).query(host, k)[0], rtol=1e-5)
+def assert_knn_is_right(points, mask, k):
+    """Neighbours of every row at the distances that cKDTree finds among the valid points; the own index where it finds none."""
+    index = np.asarray(knn(jnp.asarray(points), jnp.asarray(mask), k))
+    host, num = np.asarray(points, np.float64), min(k, mask.sum())
+    assert mask[index[:, :num]].all()
+    assert all(len({*row}) == num for row in index[:, :num])
+    if num:
+        distance = cKDTree(host[mask]).query(host, num)[0].reshape(len(host), num)
+        found = np.linalg.norm(host[index[:, :num]] - host[:, None], axis=2)
+        np.testing.assert_allclose(found, distance, rtol=1e-5)
+        assert np.all(np.diff(found, axis=1) >= -1e-5 * found[:, 1:])
+    np.testing.assert_array_equal(index[:, num:], np.broadcast_to(np.arange(len(host))[:, None], (len(host), k - num)))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("slack", [-2, 0, 1, 30])
+def test_knn_by_distance(seed, slack):
+    """Oracle: cKDTree, by distance, for random sizes and masks; k = valid points - slack, from too many to a few."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(5, 80))
+    mask = rng.uniform(size=n) < 0.7
+    assert_knn_is_right(np.asarray(cloud(seed, n)), mask, int(np.clip(mask.sum() - slack, 1, n)))
+
+
+def test_knn_at_the_size_of_the_paper():
+    """Oracle: cKDTree, by distance; 1024 points up to 70 m away, k = 20, where expanded squares would be wrong by 3e-3 m^2."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, size=(1024, 3)) * [70, 70, 3]
+    points[:512] = [68, -69, 1] + rng.uniform(-0.3, 0.3, size=(512, 3))  # half of them within centimetres, far out
+    assert_knn_is_right(points.astype(np.float32), np.ones(1024, bool), 20)
+    assert_knn_is_right(points.astype(np.float32), rng.uniform(size=1024) < 0.9, 20)
+
+
+@pytest.mark.parametrize("copies", [2, 7, 40])
+def test_knn_of_coincident_points(copies):
+    """Oracle: cKDTree, by distance; copies of a point are at distance zero, every one of them a neighbour of its own."""
+    points = np.repeat(np.asarray(cloud(0, 6)), copies, axis=0)
+    assert_knn_is_right(points, np.ones(len(points), bool), min(10, len(points)))
+    index = np.asarray(knn(jnp.asarray(points), jnp.ones(len(points), bool), copies))
+    np.testing.assert_array_equal(index // copies, np.broadcast_to(np.arange(len(points))[:, None] // copies, index.shape))
+
+
+def test_first_neighbour_is_the_point_itself():
+    """Oracle: distance zero."""
+    np.testing.assert_array_equal(knn(cloud(0, 200), jnp.ones(200, bool), 3)[:, 0], np.arange(200))
+
+
+def test_knn_permutes_with_its_points():
+    """Oracle: symmetry in the order of the points."""
+    points, order = cloud(0, 50), np.random.default_rng(0).permutation(50)
+    mask = np.random.default_rng(1).uniform(size=50) < 0.8
+    moved = np.asarray(knn(points[order], jnp.asarray(mask[order]), 8))
+    np.testing.assert_array_equal(order[moved], np.asarray(knn(points, jnp.asarray(mask), 8))[order])
 
 
 def test_knn_of_too_few_valid_points_repeats_the_own_index():

@@ -1,6 +1,7 @@
 """The training run: phases, checkpoints, resumption. The network's own step has its tests; here an exact one stands in."""
 
 import dataclasses
+import logging
 from types import SimpleNamespace
 
 import jax
@@ -12,6 +13,7 @@ import pytest
 from delo_jax.errors import ConfigError
 from delo_jax.model import delo
 from delo_jax.train import loop
+from delo_jax.train.presets import PRESETS
 from delo_jax.train.step import TrainState
 from tests.fixtures import TINY_TRAINING, street_world, tiny_model
 
@@ -49,9 +51,13 @@ def stand_ins(monkeypatch):
 
         def train_step(state, batch):
             pull = phase * jnp.mean(batch.T_init) + jnp.sum(batch.source.points) * 1e-3 + state.step
-            gradients = jax.tree.map(lambda leaf: leaf + pull, state.params)
-            updates, opt_state = tx.update(gradients, state.opt_state, state.params)
-            return TrainState(optax.apply_updates(state.params, updates), opt_state, state.step + 1), {"loss": pull}
+            params = state.variables["params"]
+            updates, opt_state = tx.update(jax.tree.map(lambda leaf: leaf + pull, params), state.opt_state, params)
+            variables = {
+                "params": optax.apply_updates(params, updates),
+                "batch_stats": {"mean": state.variables["batch_stats"]["mean"] + pull},
+            }
+            return TrainState(variables, opt_state, state.step + 1, state.num_nonfinite), {"loss": pull}
 
         return jax.jit(train_step, donate_argnums=0)
 
@@ -63,7 +69,8 @@ def stand_ins(monkeypatch):
     monkeypatch.setattr(loop, "make_train_step", make_train_step)
     monkeypatch.setattr(loop, "worlds", worlds)
     monkeypatch.setattr(loop, "validate", lambda model, held_out: [])
-    weights = delo.Model({"params": {"a": jnp.ones(3), "b": {"c": jnp.arange(4.0)}}}, tiny_model().cfg)
+    params = {"a": jnp.ones(3), "b": {"c": jnp.arange(4.0)}}
+    weights = delo.Model({"params": params, "batch_stats": {"mean": jnp.zeros(2)}}, tiny_model().cfg)
     monkeypatch.setattr(delo, "init", lambda cfg, key: delo.Model(jax.tree.map(jnp.array, weights.variables), cfg))
 
 
@@ -74,8 +81,8 @@ def as_bytes(model):
 def test_run_goes_through_its_pieces(tmp_path):
     """Oracle: the config, by hand: two phases; validation and checkpoint every fourth step and at the end of a phase."""
     reporter = Reporter()
-    model, errors = loop.train(CFG, tmp_path, reporter)
-    assert (model.cfg, errors) == (CFG.model, [])
+    model, errors, num_nonfinite = loop.train(CFG, tmp_path, reporter)
+    assert (model.cfg, errors, num_nonfinite) == (CFG.model, [], 0)
     assert reporter.pieces == [
         ("simulating training worlds", 2, 0),
         ("simulating validation worlds", 1, 0),
@@ -89,20 +96,48 @@ def test_run_goes_through_its_pieces(tmp_path):
 
 def test_phases_switch_the_losses():
     """Oracle: by hand; first all but the evidence, then the evidence alone."""
-    (pose, num_pose), (evidence, num_evidence) = loop.phases(CFG)
+    (pose, num_pose), (evidence, num_evidence) = loop.phases(CFG, 11)
     assert (num_pose, num_evidence) == (11, 10)
-    assert (pose.coarse_weight, pose.fine_weight, pose.evidence_weight) == (CFG.coarse_weight, CFG.fine_weight, 0.0)
-    assert (evidence.coarse_weight, evidence.fine_weight, evidence.evidence_weight) == (0.0, 0.0, CFG.evidence_weight)
+    assert (pose.matching_weight, pose.fine_weight, pose.evidence_weight) == (CFG.matching_weight, CFG.fine_weight, 0.0)
+    assert (evidence.matching_weight, evidence.fine_weight, evidence.evidence_weight) == (0.0, 0.0, CFG.evidence_weight)
+
+
+def test_evidence_learned_together_is_one_phase():
+    """Oracle: by hand; the paper's loss of everything at once, for all steps of the run."""
+    paper = PRESETS["paper"]
+    assert loop.phases(paper, 1234) == [(paper, 1234)]
+    apart = dataclasses.replace(paper, num_evidence_steps=20)
+    (pose, num_pose), (evidence, num_evidence) = loop.phases(apart, 1234)
+    assert (num_pose, num_evidence) == (1234, 20)
+    assert (pose.odometry_weight, pose.evidence_weight) == (1.0, 0.0)
+    assert (evidence.odometry_weight, evidence.evidence_weight) == (0.0, 1.0)
+
+
+def test_epochs_are_counted_in_frames_that_have_a_successor():
+    """Oracle: by hand; worlds of 6 and 5 frames hold 5 + 4 of them, in batches of 2 that is 4 steps an epoch."""
+    worlds = [street_world(CFG.model.preprocess), street_world(CFG.model.preprocess, 5)]
+    cfg = dataclasses.replace(CFG, num_steps=11, batch_size=2)
+    assert loop.count_steps(cfg, worlds) == 11
+    assert loop.count_steps(dataclasses.replace(cfg, num_epochs=75), worlds) == 75 * 4
+    assert loop.count_steps(dataclasses.replace(cfg, num_epochs=3, batch_size=16), worlds) == 3  # at least one step an epoch
+
+
+def test_joint_run_of_epochs(tmp_path):
+    """Oracle: by hand; one phase of 5 epochs of 4 steps: two worlds of 3 frames, one pair a step."""
+    reporter = Reporter()
+    loop.train(dataclasses.replace(CFG, num_epochs=5, num_steps=0, num_evidence_steps=0), tmp_path, reporter)
+    assert reporter.pieces[2:] == [("learning poses", 20, 0)]
+    assert reporter.validations == [4, 8, 12, 16, 20]
 
 
 @pytest.mark.parametrize(
     ("weights", "pieces", "num_steps"),
     [
         ({"fine_weight": 0.0}, [("learning poses", 11, 0), ("learning evidence", 10, 0)], 21),
-        ({"coarse_weight": 0.0}, [("learning poses", 11, 0), ("learning evidence", 10, 0)], 21),
-        ({"coarse_weight": 0.0, "fine_weight": 0.0}, [("learning evidence", 10, 0)], 10),
+        ({"matching_weight": 0.0}, [("learning poses", 11, 0), ("learning evidence", 10, 0)], 21),
+        ({"matching_weight": 0.0, "fine_weight": 0.0}, [("learning evidence", 10, 0)], 10),
         ({"evidence_weight": 0.0}, [("learning poses", 11, 0)], 11),
-        ({"coarse_weight": 0.0, "fine_weight": 0.0, "evidence_weight": 0.0}, [], 0),
+        ({"matching_weight": 0.0, "fine_weight": 0.0, "evidence_weight": 0.0}, [], 0),
     ],
 )
 def test_phase_without_a_loss_is_left_out(tmp_path, weights, pieces, num_steps):
@@ -113,29 +148,101 @@ def test_phase_without_a_loss_is_left_out(tmp_path, weights, pieces, num_steps):
     assert len(reporter.notes) == num_steps
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_loss_that_is_no_number_stops_the_training(tmp_path, monkeypatch, value):
-    """Oracle: the sentence; of the state that went wrong nothing is stored, the next run goes on from the last good one."""
+def failing_at(steps):
+    """A stand-in that leaves out these steps and counts them, as the real one does."""
     make_train_step = loop.make_train_step
 
     def make_failing(cfg, tx):
         train_step = make_train_step(cfg, tx)
 
         def failing(state, batch):
-            number = int(state.step)
-            state, metrics = train_step(state, batch)
-            return state, {"loss": jnp.float32(value)} if number == 7 else metrics
+            if int(state.step) in steps:
+                return state._replace(step=state.step + 1, num_nonfinite=state.num_nonfinite + 1), {"loss": jnp.float32(np.nan)}
+            return train_step(state, batch)
 
         return failing
 
-    reporter, second = Reporter(), Reporter()
+    return make_failing
+
+
+def test_steps_left_out_are_counted_and_reported(tmp_path, monkeypatch, caplog):
+    """Oracle: by hand; the third and fifth of the first phase, the second of the second phase."""
+    monkeypatch.setattr(loop, "make_train_step", failing_at({2, 4, 12}))
+    reporter = Reporter()
+    with caplog.at_level(logging.WARNING, loop.__name__):
+        _, _, num_nonfinite = loop.train(CFG, tmp_path, reporter)
+    assert num_nonfinite == 3
+    assert len(reporter.notes) == 21
+    counts = [int(note.split(", ")[1].split()[0]) if "," in note else 0 for note in reporter.notes]
+    assert counts == [0, 0, 1, 1] + [2] * 8 + [3] * 9
+    assert reporter.notes[4].endswith(", 2 not finite")
+    assert [record.getMessage() for record in caplog.records] == ["3 of 21 steps were left out: loss or gradient was not finite"]
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(loop.train(CFG, tmp_path, Reporter())[0]))
+
+
+def test_left_out_steps_are_counted_across_an_interruption(tmp_path, monkeypatch):
+    """Oracle: the count of the run that nobody interrupted."""
+    monkeypatch.setattr(loop, "make_train_step", failing_at({2, 4, 12}))
+    _, _, expected = loop.train(CFG, tmp_path / "whole", Reporter())
+    for stop_after in (7, 9):  # within the first phase, within the second
+        with pytest.raises(KeyboardInterrupt):
+            loop.train(CFG, tmp_path / "other", Reporter(stop_after))
+    _, _, found = loop.train(CFG, tmp_path / "other", Reporter())
+    assert found == expected == 3
+
+
+def test_training_that_goes_nowhere_stops(tmp_path, monkeypatch):
+    """Oracle: the sentence; ten steps may fail whenever they like, of more a tenth. The next run goes on from the last checkpoint."""
+    cfg = dataclasses.replace(CFG, num_steps=40, num_evidence_steps=0, validate_every=30)
+    reporter = Reporter()
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "make_train_step", make_failing)
-        with pytest.raises(ConfigError, match=f"step 8: expected a finite loss, got {value}; lower learning_rate"):
-            loop.train(CFG, tmp_path, reporter)
-    assert (len(reporter.notes), reporter.validations) == (7, [4])
-    loop.train(CFG, tmp_path, second)
-    assert second.pieces[2] == ("learning poses", 11, 4)
+        patch.setattr(loop, "make_train_step", failing_at(range(20, 40)))
+        with pytest.raises(ConfigError, match="step 31: expected finite steps, got 11 of 31 with a loss or gradient that is not fin"):
+            loop.train(cfg, tmp_path, reporter)
+    assert (len(reporter.notes), reporter.validations) == (30, [30])
+    second = Reporter()
+    _, _, num_nonfinite = loop.train(cfg, tmp_path, second)
+    assert second.pieces[2] == ("learning poses", 40, 30)
+    assert num_nonfinite == 10
+
+
+@pytest.mark.parametrize(
+    ("num_nonfinite", "num_done", "healthy"), [(10, 10, True), (11, 109, False), (11, 110, True), (120, 1200, True), (121, 1200, False)]
+)
+def test_a_tenth_of_the_steps_may_fail(num_nonfinite, num_done, healthy):
+    """Oracle: the documented limit, by hand."""
+    if healthy:
+        loop._check_health(num_done, num_nonfinite)
+    else:
+        with pytest.raises(ConfigError, match="lower learning_rate"):
+            loop._check_health(num_done, num_nonfinite)
+
+
+@pytest.mark.parametrize(("recorded", "data"), [("00 01", False), ("", True)])
+def test_sequences_and_their_tree_come_together(tmp_path, recorded, data):
+    """Oracle: the sentence."""
+    with pytest.raises(ConfigError, match="recorded: expected sequence names exactly when there is a tree of recorded data; give both"):
+        loop.train(dataclasses.replace(CFG, recorded=recorded), tmp_path / "out", Reporter(), tmp_path if data else None)
+    assert not (tmp_path / "out").exists()
+
+
+def test_recorded_worlds_are_what_is_trained_on(tmp_path, monkeypatch):
+    """Oracle: the calls; names, tree and both parts of every sequence, and no simulation."""
+    calls = []
+
+    def recorded_worlds(root, names, cfg, folder, *, validation, on_world):
+        calls.append((root, names, cfg, folder, validation))
+        yield street_world(cfg, 3)
+        on_world()
+
+    monkeypatch.setattr(loop, "recorded_worlds", recorded_worlds)
+    monkeypatch.setattr(loop, "count_recorded", lambda root, names, *, validation: 1)
+    monkeypatch.delattr(loop, "worlds")
+    reporter, tree = Reporter(), tmp_path / "tree"
+    loop.train(dataclasses.replace(CFG, recorded="00 07"), tmp_path, reporter, tree)
+    expected = tree, ["00", "07"], CFG.model.preprocess, tmp_path / "worlds"
+    assert calls == [(*expected, False), (*expected, True)]
+    assert reporter.pieces[:2] == [("reading training scans", 1, 0), ("reading validation scans", 1, 0)]
 
 
 def test_batch_that_does_not_divide_over_the_devices(tmp_path, monkeypatch):
@@ -176,7 +283,7 @@ def test_interrupted_run_ends_where_the_other_does(tmp_path, whole_run, stop_aft
     with pytest.raises(error):
         loop.train(CFG, tmp_path, Reporter(stop_after, error))
     second = Reporter()
-    found, _ = loop.train(CFG, tmp_path, second)
+    found, _, _ = loop.train(CFG, tmp_path, second)
     assert as_bytes(found) == uninterrupted(whole_run, tmp_path)
     if error is KeyboardInterrupt:
         assert len(second.notes) == 21 - stop_after
@@ -217,9 +324,9 @@ def test_ctrl_c_at_the_worst_moment(tmp_path, whole_run, monkeypatch, moment):
 
 def test_finished_run_is_only_read(tmp_path):
     """Oracle: the first run's weights; not one step more."""
-    first, _ = loop.train(CFG, tmp_path, Reporter())
+    first, _, _ = loop.train(CFG, tmp_path, Reporter())
     reporter = Reporter()
-    again, _ = loop.train(CFG, tmp_path, reporter)
+    again, _, _ = loop.train(CFG, tmp_path, reporter)
     assert as_bytes(again) == as_bytes(first)
     assert reporter.notes == []
     assert reporter.pieces[-2:] == [("learning poses", 11, 11), ("learning evidence", 10, 10)]
@@ -254,7 +361,7 @@ def test_the_real_thing_runs_from_end_to_end(tmp_path, monkeypatch):
     monkeypatch.undo()
     cfg = dataclasses.replace(CFG, num_scenes=1, num_steps=10, num_evidence_steps=10, validate_every=10, num_frames=2)
     monkeypatch.setattr(loop, "worlds", lambda cfg, folder, **_: iter([street_world(cfg.model.preprocess, cfg.num_frames)]))
-    model, errors = loop.train(cfg, tmp_path, Reporter())
+    model, errors, _ = loop.train(cfg, tmp_path, Reporter())
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model))
     assert [row.gap for row in errors] == [1]
     assert np.isfinite(errors[0].median_cm)

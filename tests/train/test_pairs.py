@@ -1,17 +1,24 @@
 """Training pairs: truth, augmentation, starts, determinism."""
 
+import dataclasses
 import functools
+from collections import Counter
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from delo_jax.config import PreprocessConfig
-from delo_jax.train.pairs import make_batch, random_pair, unrelated_pair
+from delo_jax.config import PreprocessConfig, TrainConfig
+from delo_jax.preprocess import Scan, preprocess
+from delo_jax.train.pairs import make_batch, random_frames, random_pair, unrelated_pair
+from delo_jax.train.presets import PRESETS
+from delo_jax.train.worlds import World, scan_of, stored_config
 from tests.fixtures import TINY_TRAINING, simulated_world, street_world
+from tests.oracles import street
 
 CFG = PreprocessConfig(max_points=1500)
+TRAINING = TrainConfig()
 
 
 @functools.cache
@@ -45,7 +52,7 @@ def test_truth_lays_the_source_on_the_surfaces_of_the_target(name, median_m, sha
     """
     sharper = 0
     for seed in range(20):
-        pair = random_pair(world(name), np.random.default_rng(seed))
+        pair = random_pair(world(name), TRAINING, np.random.default_rng(seed))
         assert_rigid(pair.T_target_source)
         errors, agreement = plane_errors(pair, pair.T_target_source)
         assert np.median(errors) < median_m
@@ -61,7 +68,7 @@ def test_augmented_scan_is_still_a_scan():
     features = {row.tobytes() for frame in range(len(originals.mask)) for row in originals.features[frame][originals.mask[frame]]}
     num_dropped = 0
     for seed in range(12):
-        pair = random_pair(world("street"), np.random.default_rng(seed))
+        pair = random_pair(world("street"), TRAINING, np.random.default_rng(seed))
         for scan in (pair.source, pair.target):
             count = scan.mask.sum()
             num_dropped += count < 0.9 * originals.mask.sum(axis=1).min()
@@ -79,7 +86,7 @@ def test_key_points_follow_their_rows():
     """Oracle: features, which no augmentation changes, name the places."""
     originals = world("street").scans
     for seed in range(6):
-        pair = random_pair(world("street"), np.random.default_rng(seed))
+        pair = random_pair(world("street"), TRAINING, np.random.default_rng(seed))
         rows = {*map(bytes, pair.source.features[pair.source.mask])}
         frame = next(k for k in range(len(originals.mask)) if rows <= {*map(bytes, originals.features[k])})
         before = originals.features[frame][originals.keypoint_index[frame][originals.keypoint_mask[frame]]]
@@ -93,7 +100,7 @@ def test_starts_are_the_identity_or_near_the_truth():
     """Oracle: the documented starts. The identity of the scans as they were is a pure yaw after the augmentation."""
     kinds = {"identity": 0, "disturbed": 0}
     for seed in range(60):
-        pair = random_pair(world("street"), np.random.default_rng(seed))
+        pair = random_pair(world("street"), TRAINING, np.random.default_rng(seed))
         assert_rigid(pair.T_init)
         error = np.linalg.inv(pair.T_init.astype(np.float64)) @ pair.T_target_source
         if not np.any(pair.T_init[:3, 3]):
@@ -109,7 +116,7 @@ def test_starts_are_the_identity_or_near_the_truth():
 
 def test_a_third_starts_from_the_coarse_stage():
     """Oracle: a binomial of 1/3; five standard deviations."""
-    draws = [bool(random_pair(world("street"), np.random.default_rng(seed)).from_coarse) for seed in range(90)]
+    draws = [bool(random_pair(world("street"), TRAINING, np.random.default_rng(seed)).from_coarse) for seed in range(90)]
     assert abs(np.mean(draws) - 1 / 3) < 5 * np.sqrt(2 / 9 / 90)
 
 
@@ -119,7 +126,7 @@ def test_same_generator_same_batch(evidence):
     worlds = [street_world(TINY_TRAINING.model.preprocess), street_world(TINY_TRAINING.model.preprocess, 3)]
 
     def batch(seed):
-        pairs = make_batch(worlds, 3, np.random.default_rng((0, seed)), evidence=evidence)
+        pairs = make_batch(worlds, dataclasses.replace(TINY_TRAINING, batch_size=3), np.random.default_rng((0, seed)), evidence=evidence)
         arrays = [*pairs.source, *pairs.target, *pairs[2:]]
         assert {len(array) for array in arrays} == {3}
         assert pairs.T_target_source.dtype == pairs.T_init.dtype == np.float32
@@ -134,8 +141,124 @@ def test_unrelated_pair_is_lost_whatever_the_answer():
     first, second = world("street"), world("simulated")
     lengths = []
     for seed in range(10):
-        pair = unrelated_pair(first, second, np.random.default_rng(seed))
+        pair = unrelated_pair(first, second, TRAINING, np.random.default_rng(seed))
         assert_rigid(pair.T_target_source)
         error = np.linalg.inv(pair.T_init.astype(np.float64)) @ pair.T_target_source
         lengths.append(np.linalg.norm(error[:3, 3]))
     assert np.median(lengths) > 3.0
+
+
+@pytest.mark.parametrize("augment", [False, True])
+@pytest.mark.parametrize(("num_frames", "max_gap"), [(6, 3), (6, 5), (4, 9), (2, 1)])
+def test_frames_are_any_two_that_are_near(num_frames, max_gap, augment):
+    """Oracle: the list of allowed pairs, each equally likely: a chi-squared of 4000 draws within five standard deviations."""
+    cfg = dataclasses.replace(TRAINING, max_gap=max_gap, augment=augment)
+    rng = np.random.default_rng(0)
+    counts = Counter(random_frames(num_frames, cfg, rng) for _ in range(4000))
+    allowed = [(a, b) for a in range(num_frames) for b in range(a + 1, num_frames) if b - a <= max_gap]
+    allowed += [(b, a) for a, b in allowed] if augment else []
+    assert counts.keys() == set(allowed)
+    expected = 4000 / len(allowed)
+    chi_squared = sum((count - expected) ** 2 / expected for count in counts.values())
+    degrees = len(allowed) - 1
+    assert chi_squared < degrees + 5 * np.sqrt(2 * degrees) + 1e-9
+
+
+RAW = dataclasses.replace(PRESETS["paper"].model, preprocess=PreprocessConfig(sampling="raw", max_points=96, num_keypoints=96))
+RAW_TRAINING = dataclasses.replace(PRESETS["paper"], model=RAW, batch_size=2, max_gap=2)
+
+
+@functools.cache
+def raw_world(num_frames=5):
+    """A world of exact points, four times as many as one input takes; the third scan has fewer than one input takes."""
+    poses = [street.pose(0.9 * k - 6.0, 0.1 * k, yaw_deg=2.0 * k) for k in range(num_frames)]
+    clouds = [street.scan(T, num_rings=8, num_columns=180).points for T in poses]
+    clouds[2] = clouds[2][:70]
+    scans = [preprocess(points, stored_config(RAW.preprocess)) for points in clouds]
+    return World(Scan(*(np.stack(arrays) for arrays in zip(*scans, strict=True))), np.array(poses)), clouds
+
+
+def rows_of(points):
+    return [row.tobytes() for row in points]
+
+
+def test_raw_scans_are_drawn_anew_without_replacement():
+    """Oracle: sets of rows; every draw is of the scan's own points, none of them twice, and no two draws are the same."""
+    world, clouds = raw_world()
+    known = [set(rows_of(points)) for points in clouds]
+    draws = set()
+    for seed in range(20):
+        pair = random_pair(world, RAW_TRAINING, np.random.default_rng(seed))
+        for scan in (pair.source, pair.target):
+            assert [array.shape for array in scan] == [(96, 3), (0, 3), (0, 8), (96,), (96,), (96,)]
+            count = int(scan.mask.sum())
+            rows = rows_of(scan.points[:count])
+            assert count in (70, 96)
+            assert len(set(rows)) == count
+            assert any(set(rows) <= points for points in known)
+            np.testing.assert_array_equal(scan.mask, np.arange(96) < count)
+            np.testing.assert_array_equal(scan.keypoint_mask, scan.mask)
+            np.testing.assert_array_equal(scan.keypoint_index, np.arange(96))
+            assert not scan.points[count:].any()
+            draws.add(b"".join(rows))
+    assert len(draws) == 40
+
+
+def test_draws_reach_every_stored_point():
+    """Oracle: counting; 200 draws of a quarter each leave no point out."""
+    world, _ = raw_world()
+    stored = set(rows_of(world.scans.points[0][world.scans.mask[0]]))
+    seen = set()
+    for seed in range(200):
+        pair = random_pair(world._replace(Ts_world_lidar=world.Ts_world_lidar[:2]), RAW_TRAINING, np.random.default_rng(seed))
+        seen |= set(rows_of(pair.source.points[pair.source.mask]))
+    assert len(stored) == 4 * 96
+    assert seen == stored
+
+
+def test_pair_without_augmentation_is_as_it_was_driven():
+    """Oracle: simulator truth; the source is the earlier scan, T maps it into the later one's frame, nothing is turned or dropped."""
+    world, clouds = raw_world()
+    known = [set(rows_of(points)) for points in clouds]
+    seen = set()
+    for seed in range(60):
+        pair = random_pair(world, RAW_TRAINING, np.random.default_rng(seed))
+        source, target = (
+            next(k for k, points in enumerate(known) if set(rows_of(scan.points[scan.mask])) <= points)
+            for scan in (pair.source, pair.target)
+        )
+        assert 0 < target - source <= 2
+        T = np.linalg.inv(world.Ts_world_lidar[target]) @ world.Ts_world_lidar[source]
+        np.testing.assert_allclose(pair.T_target_source, T, atol=1e-5)
+        np.testing.assert_array_equal(pair.T_init, np.eye(4))
+        assert pair.from_coarse
+        seen.add((source, target))
+    assert len(seen) == 7  # gaps 1 and 2 of five frames
+
+
+def test_augmented_raw_scan_is_turned_alone():
+    """Oracle: symmetry; distances between the sensor and its points stay, rows stay in the front, nothing but points moves."""
+    world, clouds = raw_world()
+    ranges = np.sort(np.linalg.norm(np.concatenate(clouds), axis=1))
+    for seed in range(8):
+        pair = random_pair(world, dataclasses.replace(RAW_TRAINING, augment=True), np.random.default_rng(seed))
+        assert_rigid(pair.T_target_source)
+        for scan in (pair.source, pair.target):
+            count = int(scan.mask.sum())
+            np.testing.assert_array_equal(scan.mask, np.arange(96) < count)
+            np.testing.assert_array_equal(scan.keypoint_mask, scan.mask)
+            found = np.linalg.norm(scan.points[:count], axis=1)
+            nearest = np.clip(np.searchsorted(ranges, found), 1, len(ranges) - 1)
+            assert np.all(np.minimum(abs(ranges[nearest] - found), abs(ranges[nearest - 1] - found)) < 1e-3)
+            assert scan.normals.shape == (0, 3)
+
+
+def test_inference_sees_the_first_points_of_a_stored_scan():
+    """Oracle: the stored rows by hand; a scan of a surface world stays as it is."""
+    world, _ = raw_world()
+    scan = scan_of(world, 1, RAW.preprocess)
+    np.testing.assert_array_equal(scan.points, world.scans.points[1][:96])
+    assert scan.mask.all()
+    assert len(scan.keypoint_index) == len(scan.keypoint_mask) == 96
+    surface = street_world(CFG)
+    assert all(np.array_equal(a, b[2]) for a, b in zip(scan_of(surface, 2, CFG), surface.scans, strict=True))

@@ -15,6 +15,7 @@ GOOD = {
     "confidence": 0.5,
     "seen": Observability(np.array([1e-3, 0.1, 0.2, 0.3, 0.4, 0.5]), np.eye(6)[::-1]),
 }
+NO_HEAD = "this network has no evidence head: nothing says how far its pose can be trusted"
 SLIPPERY = Observability(np.array([5e-4, 0.1, 0.2, 0.3, 0.4, 0.5]), np.eye(6)[[4, 0, 1, 2, 3, 5]])
 
 
@@ -26,6 +27,9 @@ SLIPPERY = Observability(np.array([5e-4, 0.1, 0.2, 0.3, 0.4, 0.5]), np.eye(6)[[4
         ({"confidence": 0.4999}, "low_confidence", "confidence 0.50 is below 0.5", 0.4999),
         ({"confidence": 0.05}, "low_confidence", "confidence 0.05 is below 0.5", 0.05),
         ({"confidence": 0.01}, "rejected", "confidence 0.01 is below 0.05", 0.01),
+        ({"confidence": None}, "low_confidence", NO_HEAD, 0.0),
+        ({"confidence": None, "seen": SLIPPERY}, "degenerate", "hardly any surface holds lateral (0.00050 is below 0.001)", 0.0),
+        ({"confidence": None, "finite": False}, "rejected", "the solver returned no finite pose", 0.0),
         ({"finite": False}, "rejected", "the solver returned no finite pose", 0.0),
         ({"num_points": (99, 100)}, "rejected", "source has 99 usable points, fewer than 100", 0.0),
         ({"num_points": (3000, 0)}, "rejected", "target has 0 usable points, fewer than 100", 0.0),

@@ -1,0 +1,129 @@
+"""Mass m and iterations xi of the paper's transport (its Sec. 3.1), on the frozen features of the trained `paper` preset.
+
+For every m and xi: errors of Procrustes on the plan, how uneven the row weights are (what selects points), how sharp the rows
+are, and how far the marginals are from being kept after so few iterations. With uniform marginals m = 1 is a balanced plan: at
+convergence every source point weighs the same, nothing is refused; small m with no cap active is the soft pointer of DCP.
+
+Run:     python experiments/transport_sweep.py --weights runs/paper-preset/delo-paper.safetensors     (about 5 minutes on 2 cores)
+Expect:  all bounds kept; the figure is written beside the weights.
+"""
+
+import dataclasses
+from dataclasses import replace
+from pathlib import Path
+
+import _harness
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _harness import Row
+from matplotlib.figure import Figure
+
+import delo_jax
+from delo_jax import inference
+from delo_jax.geometry import se3
+from delo_jax.model import delo
+from delo_jax.ops.matching import uniform_marginal
+from delo_jax.ops.transport import marginal_excess
+from delo_jax.preprocess import preprocess
+from delo_jax.sim import KINDS, simulate_clip
+
+TEST_SEED = 7_000_000
+GAPS = (1, 3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Sizes of the sweep."""
+
+    masses: tuple[float, ...] = (0.1, 0.25, 0.5, 0.75, 1.0)
+    rounds: tuple[int, ...] = (1, 5, 20, 200)
+    num_worlds: int = 30
+
+
+QUICK = Settings(masses=(0.1, 1.0), rounds=(1, 5), num_worlds=2)
+
+
+def features(model: delo.Model, num_worlds: int, bar) -> list:
+    """(source, target, descriptors of both in context, T_target_source, gap) of all pairs of unseen clips."""
+    in_context = jax.jit(lambda source, target: delo.match(model, source, target)[:2])
+    found = []
+    for index in bar.track(range(num_worlds), description="features"):
+        clip = simulate_clip(KINDS[index % len(KINDS)], TEST_SEED + index)
+        encodings = [inference.encode(model, preprocess(scan.points, model.cfg.preprocess)) for scan in clip]
+        for gap in GAPS:
+            for k in range(len(clip) - gap):
+                T = se3.inverse(clip[k + gap].T_world_lidar) @ clip[k].T_world_lidar
+                pair = encodings[k], encodings[k + gap]
+                found.append((*pair, *in_context(*pair), T, gap))
+    return found
+
+
+def evaluate(model: delo.Model, pairs: list) -> dict[int, np.ndarray]:
+    """Per gap, rows of: error [cm], error [deg], variation of the row sums, sharpness, excess of the marginals."""
+
+    @jax.jit
+    def one(source, target, ours, theirs):
+        masks = source.keypoint_mask, target.keypoint_mask
+        plan = model.apply("plan", ours, theirs, *masks)
+        rows, total = jnp.sum(plan, axis=1), jnp.sum(plan)
+        mean = total / jnp.sum(masks[0])
+        variation = jnp.sqrt(jnp.sum(jnp.where(masks[0], (rows - mean) ** 2, 0.0)) / jnp.sum(masks[0])) / mean
+        numbers = variation, jnp.sum(jnp.max(plan, axis=1)) / total, marginal_excess(plan, *map(uniform_marginal, masks))
+        return delo.coarse(model, source, target, plan).T_target_source, jnp.stack(numbers)
+
+    rows: dict[int, list] = {gap: [] for gap in GAPS}
+    for *arguments, T_true, gap in pairs:
+        T, numbers = one(*arguments)
+        error = se3.inverse(np.asarray(T, np.float64)) @ T_true
+        cm, deg = 100 * np.linalg.norm(error[:3, 3]), np.degrees(se3.rotation_angle(error[:3, :3]))
+        rows[gap].append([cm, deg, *np.asarray(numbers)])
+    return {gap: np.array(values) for gap, values in rows.items()}
+
+
+def draw(medians: dict, settings: Settings, file: Path) -> None:
+    """Errors and row-weight variation over m, a line per xi."""
+    figure = Figure(figsize=(12, 3.5), layout="constrained")
+    labels = "median error at gap 1 [cm]", "median error at gap 1 [deg]", "row-weight variation at gap 1"
+    for column, (axes, label) in enumerate(zip(figure.subplots(1, 3), labels, strict=True)):
+        for rounds in settings.rounds:
+            axes.plot(settings.masses, [medians[mass, rounds][1][column] for mass in settings.masses], marker="o", label=f"xi = {rounds}")
+        axes.set(xlabel="mass m", ylabel=label, ylim=(0, None))
+        axes.legend()
+    figure.savefig(file, dpi=120)
+    print(f"\nfigure: {file}")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Sweep, print, judge."""
+    parser = _harness.parser(__doc__, needs_data=False)
+    parser.add_argument("--weights", type=Path, required=True, help="of the paper preset, as experiments/paper_preset.py writes them")
+    args = parser.parse_args(argv)
+    settings = QUICK if args.quick else Settings()
+    model = delo_jax.load(args.weights)
+    medians = {}
+    head = " | ".join(f"gap {gap}: cm | deg" for gap in GAPS)
+    with _harness.progress() as bar:
+        pairs = features(model, settings.num_worlds, bar)
+        task = bar.add_task("sweep", total=len(settings.masses) * len(settings.rounds))
+        print(f"| m | xi | {head} | row-weight variation | sharpness % | largest excess % |\n|---:|---:|{'---:|' * 7}")
+        for mass in settings.masses:
+            for rounds in settings.rounds:
+                matching = replace(model.cfg.matching, mass=mass, num_iters=rounds)
+                errors = evaluate(delo.Model(model.variables, replace(model.cfg, matching=matching)), pairs)
+                medians[mass, rounds] = {gap: np.median(values, axis=0) for gap, values in errors.items()}
+                cells = " | ".join(f"{medians[mass, rounds][gap][0]:.0f} | {medians[mass, rounds][gap][1]:.2f}" for gap in GAPS)
+                variation, sharpness, excess = medians[mass, rounds][1][2:]
+                print(f"| {mass:g} | {rounds} | {cells} | {variation:.2f} | {100 * sharpness:.0f} | {100 * excess:.1f} |", flush=True)
+                bar.advance(task)
+    draw(medians, settings, args.weights.with_name("transport_sweep.png"))
+    most = max(settings.rounds)
+    rows = [
+        Row(f"row-weight variation at m = 1, xi = {most}: a balanced plan refuses nothing", float(medians[1.0, most][1][2]), "", 0.05),
+        Row(f"median excess of a cap at m = 0.1, xi = {most}", 100 * float(medians[0.1, most][1][4]), "%", 1.0),
+    ]
+    return _harness.finish(rows, dataclasses.asdict(settings), args)
+
+
+if __name__ == "__main__":
+    _harness.run(main)
