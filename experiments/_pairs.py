@@ -17,12 +17,12 @@ from delo_jax.data import camera_to_lidar, read_kitti_poses
 from delo_jax.geometry import se3
 from delo_jax.preprocess import Scan, preprocess
 from delo_jax.sim import KINDS, simulate_clip
+from delo_jax.train.worlds import SIMULATOR
 
-TEST_SEED = 5_000_000  # training and validation worlds have other seeds
-TRAFFIC_SEED = 6_000_000
+TEST_SEED = 500_000  # training and validation worlds of any run begin at whole millions
+TRAFFIC_SEED = 1_500_000
 DENSE_TRAFFIC = 10.0
 NUM_FRAMES = 6
-SIMULATOR = 1  # counts the changes of `delo_jax.sim` that change a world
 
 
 class Sequence(NamedTuple):
@@ -39,6 +39,7 @@ class Pairs(NamedTuple):
     source: np.ndarray  # (n,) frame numbers
     target: np.ndarray
     T_target_source: np.ndarray  # (n, 4, 4)
+    group: np.ndarray  # (n,) pairs of one number are the same two frames, both ways round
 
 
 def key_points(scan: Scan) -> Scan:
@@ -55,10 +56,10 @@ def stack(scans: list[Scan]) -> Scan:
 
 def simulated(num_worlds: int, *, traffic: float, cfg: PreprocessConfig, folder: Path, bar: Progress) -> list[Sequence]:
     """Worlds that no training has seen, kept in `folder`; the scene kinds take turns, all scans are an HDL-64E's."""
-    text = json.dumps([SIMULATOR, NUM_FRAMES, traffic, asdict(cfg)])
+    seed = TEST_SEED if traffic == 1.0 else TRAFFIC_SEED
+    text = json.dumps([SIMULATOR, seed, NUM_FRAMES, traffic, asdict(cfg)])
     name = hashlib.sha256(text.encode()).hexdigest()[:8]
     folder.mkdir(parents=True, exist_ok=True)
-    seed = TEST_SEED if traffic == 1.0 else TRAFFIC_SEED
     found = []
     for index in bar.track(range(num_worlds), description=f"test worlds, traffic x{traffic:g}"):
         path = folder / f"test_{name}_{index:05d}.npz"
@@ -87,7 +88,7 @@ def recorded(data: Path, names: tuple[str, ...], cfg: PreprocessConfig, bar: Pro
 
 def pairs(sequences: list[Sequence], gap: int, per_sequence: int | None = None) -> Pairs:
     """Pairs (k, k + gap) of every sequence, each in both directions; at most `per_sequence` of them, evenly spread."""
-    sources, targets, poses, offset = [], [], [], 0
+    sources, targets, poses, groups, offset = [], [], [], [], 0
     for sequence in sequences:
         starts = np.arange(len(sequence.Ts_world_lidar) - gap)
         if per_sequence is not None and 2 * len(starts) > per_sequence:
@@ -96,9 +97,10 @@ def pairs(sequences: list[Sequence], gap: int, per_sequence: int | None = None) 
         poses.append(se3.inverse(sequence.Ts_world_lidar[last]) @ sequence.Ts_world_lidar[first])
         sources.append(offset + first)
         targets.append(offset + last)
+        groups.append(offset + np.r_[starts, starts])
         offset += len(sequence.Ts_world_lidar)
     frames = Scan(*(np.concatenate(arrays) for arrays in zip(*(sequence.scans for sequence in sequences), strict=True)))
-    return Pairs(frames, np.concatenate(sources), np.concatenate(targets), np.concatenate(poses))
+    return Pairs(frames, np.concatenate(sources), np.concatenate(targets), np.concatenate(poses), np.concatenate(groups))
 
 
 def half_overlap(full: Pairs, seed: int) -> Pairs:
@@ -109,7 +111,7 @@ def half_overlap(full: Pairs, seed: int) -> Pairs:
         heading, turn = rng.uniform(-np.pi, np.pi), np.pi / 2 * rng.choice([-1, 1])
         for frame, towards in ((source, heading), (target, heading + turn)):
             frames.append(_sector(Scan(*(array[frame] for array in full.frames)), towards))
-    return Pairs(stack(frames), 2 * np.arange(num), 2 * np.arange(num) + 1, full.T_target_source)
+    return Pairs(stack(frames), 2 * np.arange(num), 2 * np.arange(num) + 1, full.T_target_source, full.group)
 
 
 def _sector(scan: Scan, heading: float) -> Scan:

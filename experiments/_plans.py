@@ -93,10 +93,13 @@ def lost(errors: np.ndarray) -> np.ndarray:
     return ~((errors[..., 0] <= LOST_M) & (np.degrees(errors[..., 1]) <= LOST_DEG))
 
 
-def interval(values: np.ndarray, statistic, seed: int = 0) -> tuple[float, float]:
-    """95 % bootstrap interval of a statistic over pairs; `values` is (seeds, pairs), pairs are drawn with all their seeds."""
-    rng = np.random.default_rng(seed)
-    draws = [statistic(values[:, rng.integers(values.shape[1], size=values.shape[1])]) for _ in range(400)]
+def interval(values: np.ndarray, group: np.ndarray, statistic, seed: int = 0) -> tuple[float, float]:
+    """95 % bootstrap interval of a statistic of `values`, (seeds, pairs): groups of pairs are drawn, with all their seeds."""
+    rng, members = np.random.default_rng(seed), [np.flatnonzero(group == number) for number in np.unique(group)]
+    draws = []
+    for _ in range(400):
+        rows = np.concatenate([members[number] for number in rng.integers(len(members), size=len(members))])
+        draws.append(statistic(values[:, rows]))
     return float(np.percentile(draws, 2.5)), float(np.percentile(draws, 97.5))
 
 

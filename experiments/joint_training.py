@@ -34,7 +34,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "odometry alone": {"evidence_weight": 0.0},
     "together, weight as printed": {"evidence_weight": 1.0},
     "together, weight of the released code": {"evidence_weight": 2e-4, "translation_regulariser": 0.02},
-    "evidence afterwards": {"evidence_weight": 1.0, "num_evidence_steps": 300},
+    "evidence afterwards": {"evidence_weight": 1.0, "num_evidence_steps": 600},
 }
 
 

@@ -84,6 +84,8 @@ class EncoderConfig:
         require_one_of(self.kind, "encoder.kind", ("edge_conv", "dgcnn"))
         require_one_of(self.edges, "encoder.edges", ("relative", "absolute"))
         require_positive(self, "encoder.", "num_neighbors", "edge_scale_m", "position_scale_m", "width", "embedding_dim")
+        fits = self.edges == "relative" or self.kind == "dgcnn"
+        require(fits, "encoder.edges", "relative, the only ones of edge_conv", self.edges)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -129,6 +131,9 @@ class MatchingConfig:
         require(0.0 < self.mass <= 1.0, "matching.mass", "a value in (0, 1]", self.mass)
         require(self.num_iters >= 1, "matching.num_iters", "at least 1", self.num_iters)
         require_positive(self, "matching.", "epsilon", "num_candidates", "marginal_weight")
+        with_mass = "partial_transport", "sparse_transport", "algorithm_1", "released_code"
+        fits = not self.predict_mass or self.plan in with_mass
+        require(fits, "matching.predict_mass", f"false, since {self.plan} takes no mass", self.predict_mass)
         above = not self.learn_epsilon or self.epsilon > MIN_EPSILON
         require(above, "matching.epsilon", f"a start above {MIN_EPSILON:g} where it is learned", self.epsilon)
 
@@ -247,6 +252,8 @@ class DeloConfig:
         require(fits, "encoder.num_neighbors", "1 to preprocess.num_keypoints", self.encoder.num_neighbors)
         heads = self.attention.num_heads
         require(not heads or self.encoder.embedding_dim % heads == 0, "attention.num_heads", "a divisor of encoder.embedding_dim", heads)
+        unit = self.encoder.kind == "edge_conv" and heads == 0
+        require(unit or self.matching.scores == "scaled", "matching.scores", "scaled, since descriptors are not unit", self.matching.scores)
         surface = self.preprocess.sampling == "surface"
         require(surface or self.encoder.kind == "dgcnn", "encoder.kind", "dgcnn, since raw scans have no features", self.encoder.kind)
         require(surface or self.fine.num_iters == 0, "fine.num_iters", "0, since raw scans have no normals", self.fine.num_iters)

@@ -27,7 +27,7 @@ class TrainConfig:
     augment: bool = True
     """Random yaw, mirror, dropped points and exchange of the two scans; without it a source is always the earlier scan."""
     num_epochs: int = 0
-    """Passes over all frames of the training data; 0: as many steps as `num_steps`."""
+    """As many steps as so many passes over the training data take (pairs are drawn at random); 0: `num_steps`."""
     num_steps: int = 3000
     """Optimiser steps of matching and pose."""
     num_evidence_steps: int = 1200
@@ -86,5 +86,7 @@ class TrainConfig:
         require(
             not self.fine_weight or self.model.fine.num_iters > 0, "fine_weight", "0, since the model has no fine stage", self.fine_weight
         )
+        normalised = self.model.evidence.head == "embedding" and self.evidence_weight > 0
+        require(not normalised or self.batch_size > 1, "batch_size", "at least 2, to normalise the evidence head over", self.batch_size)
         no_head = self.model.evidence.head == "none"
         require(not (no_head and self.evidence_weight), "evidence_weight", "0, since the model has no evidence head", self.evidence_weight)

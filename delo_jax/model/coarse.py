@@ -76,7 +76,8 @@ def _reweighted(source, matched, weights, mask, cfg):
     def reweight(_, carry):
         inliers, squared = _inliers(carry[0], source, matched, mask, cfg)
         robust = 1.0 / (1.0 + squared / cfg.consistency_m**2) ** 2
-        return planar_procrustes(source, matched, (weights + 1e-3 / weights.shape[0]) * robust * mask), jnp.sum(inliers)
+        T = planar_procrustes(source, matched, (weights + 1e-3 / weights.shape[0]) * robust * mask)
+        return T, jnp.sum(inliers).astype(jnp.int32)
 
     start = planar_procrustes(source, matched, weights), jnp.zeros((), jnp.int32)
     return jax.lax.fori_loop(0, cfg.num_rounds, reweight, start)

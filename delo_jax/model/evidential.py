@@ -35,7 +35,7 @@ def _bias(_key, shape, dtype=jnp.float32):
 class PoseEvidenceHead(nn.Module):
     """Raw evidence from both clouds' embeddings and the estimated pose: the published PU-EPE network.
 
-    The embeddings are those after the transformer, as in the authors' code (the paper's text says before). Batch
+    The authors' code pools the embeddings after the transformer, the paper's text says before: the caller chooses. Batch
     normalisation runs over the items of the batch: in training, an item alone is normalised to the biases.
     """
 

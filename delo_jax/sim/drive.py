@@ -52,7 +52,7 @@ def simulate_clip(
         num_columns: replaces the sensor's own.
         turning_share: share of clips with free turning rather than lane keeping.
         rolling_shutter_share: share of clips delivered as measured.
-        traffic: density of the moving traffic, as a factor.
+        traffic: density of the moving traffic, as a factor > 0.
     """
     sensor = _resolve(sensor, num_columns)
     rng = np.random.default_rng([seed, KINDS.index(kind), 5])

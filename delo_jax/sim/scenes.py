@@ -52,7 +52,7 @@ def make_scene(kind: str, seed: int, length_m: float = 120.0, *, traffic: float 
         kind: one of `KINDS`.
         seed: of everything drawn.
         length_m: of the drivable road; it is dressed for 100 m more at both ends.
-        traffic: density of the vehicles in the lanes, as a factor.
+        traffic: density of the vehicles in the lanes, as a factor > 0.
     """
     style, ground, warp = draw_world(kind, seed)
     style = style._replace(traffic_gap=style.traffic_gap / traffic)

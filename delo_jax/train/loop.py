@@ -169,7 +169,7 @@ def _batches(cfg: TrainConfig, training: list[World], mesh: Mesh, start: int, st
     sharding = NamedSharding(mesh, PartitionSpec("batch"))
 
     def make(step: int) -> PairBatch:
-        with_failures = cfg.evidence_weight > 0 and cfg.model.evidence.head == "statistics"
+        with_failures = cfg.matching_weight + cfg.fine_weight + cfg.odometry_weight == 0  # a pose is not learned from invented truth
         batch = make_batch(training, cfg, np.random.default_rng((cfg.seed, step)), evidence=with_failures)
         return jax.device_put(batch, sharding)
 

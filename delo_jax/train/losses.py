@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 from delo_jax.config import StatusConfig
 from delo_jax.geometry import se3
+from delo_jax.geometry.se3 import full_float32
 from delo_jax.ops import evidence
 
 MATCH_SIGMA_M = 0.7  # width of a soft true match
@@ -47,6 +48,7 @@ def matching_loss(
     return total
 
 
+@full_float32
 def pose_loss(poses: Float[Array, "t 4 4"], T_true: Float[Array, "4 4"]) -> Float[Array, ""]:
     """Sum over iterations of log(1 cm + translation error) + log(1 mrad + rotation error), later ones weighing more.
 
@@ -82,6 +84,7 @@ def point_loss(
     return jnp.sum(jnp.where(mask[:, None], difference, 0.0)) / jnp.maximum(jnp.sum(mask), 1)
 
 
+@full_float32
 def matrix_loss(T: Float[Array, "4 4"], T_true: Float[Array, "4 4"]) -> Float[Array, ""]:
     """Pose loss of the released code: 5 mean((R^T R_true - I)^2) + mean((t - t_true)^2)."""
     rotation = T[:3, :3].T @ T_true[:3, :3] - jnp.eye(3)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from delo_jax.config import TrainConfig
 from delo_jax.geometry import se3
+from delo_jax.geometry.se3 import full_float32
 from delo_jax.model import delo
 from delo_jax.ops import evidence
 from delo_jax.ops.matching import barycentric_projection
@@ -84,7 +85,8 @@ def pair_loss(model: delo.Applicable, pair: PairBatch, cfg: TrainConfig, frozen:
         points, mask = source.keypoints, source.keypoint_mask
         l1 = cfg.pose_loss == "l1"
         T = first.T_target_source
-        terms["pose"] = losses.point_loss(T, T_true, points, mask) if l1 else losses.matrix_loss(T, T_true)
+        pose = losses.point_loss(T, T_true, points, mask) if l1 else losses.matrix_loss(T, T_true)
+        terms["pose"] = jnp.where(first.determined, pose, 0.0)  # else the slope of a rotation that nothing fixes is huge
         matched, sent = barycentric_projection(matching.plan, target.keypoints)
         terms["aux"] = losses.auxiliary_loss(matched, sent, T_true, points)
         weights |= {"pose": cfg.odometry_weight, "aux": cfg.odometry_weight * cfg.aux_weight}
@@ -98,7 +100,7 @@ def pair_loss(model: delo.Applicable, pair: PairBatch, cfg: TrainConfig, frozen:
         if cfg.model.evidence.head == "embedding":
             regularisers = jnp.repeat(jnp.array([cfg.rotation_regulariser, cfg.translation_regulariser]), 3)
             nig = delo.evidence_of_embedding(model, source, target, matching, first.T_target_source)
-            terms["evidence"] = losses.evidence_loss(nig, se3.pose6(T_true), regularisers)
+            terms["evidence"] = jnp.where(first.determined, losses.evidence_loss(nig, se3.pose6(T_true), regularisers), 0.0)
         else:
             terms["evidence"] = _error_evidence_term(model, source, target, pair, cfg)
     return sum((weights[name] * term for name, term in terms.items()), jnp.zeros(())), terms
@@ -113,6 +115,7 @@ def _matching_term(model, source, target, matching, T_true, cfg):
     return losses.matching_loss(model.apply("scores", matching.source, matching.target), matches, *masks)
 
 
+@full_float32
 def _error_evidence_term(model, source, target, pair, cfg):
     """Evidence of the solver's error in units of the head, and the odds of failure; the solver is not moved by it."""
     regularisers = jnp.repeat(jnp.array([cfg.rotation_regulariser, cfg.translation_regulariser]), 3)

@@ -30,7 +30,7 @@ class World(NamedTuple):
 
 
 def scan_of(world: World, frame: int, cfg: PreprocessConfig) -> Scan:
-    """One scan of a world as inference sees it: the first points of its row order, as many as one input takes."""
+    """One scan of a world as an input: of a raw one, stored with a reserve, as many points as an input takes, an even subset."""
     scan = Scan(*(array[frame] for array in world.scans))
     if cfg.sampling != "raw":
         return scan

@@ -28,7 +28,7 @@ def judge(
 
     Args:
         num_points: usable points of source and target.
-        finite: whether the solver returned numbers.
+        finite: whether the solver found a pose.
         confidence: probability that the pair is not lost; None where the network says nothing of it, which is never `ok`.
         seen: how well the surfaces hold each direction.
         cfg: thresholds.
@@ -37,7 +37,7 @@ def judge(
         which = "source" if num_points[0] <= num_points[1] else "target"
         return Health("rejected", f"{which} has {min(num_points)} usable points, fewer than {cfg.min_points}", 0.0)
     if not finite:
-        return Health("rejected", "the solver returned no finite pose", 0.0)
+        return Health("rejected", "the solver found no pose: its matches determine none", 0.0)
     known = 0.0 if confidence is None else confidence
     if confidence is not None and confidence < cfg.rejected_confidence:
         return Health("rejected", f"confidence {confidence:.2f} is below {cfg.rejected_confidence:g}", confidence)

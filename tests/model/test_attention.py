@@ -77,7 +77,7 @@ def test_embeddings_are_the_published_formula():
 
 
 def test_published_weight_count():
-    """Oracle: the count of the authors' model, audit section 1.10."""
+    """Oracle: the count of the authors' model."""
     rows, mask = jnp.zeros((4, 512)), jnp.ones(4, bool)
     assert num_weights(CoContext(num_heads=4, hidden=1024), rows, rows, mask, mask) == 5_259_264
 

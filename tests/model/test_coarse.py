@@ -13,7 +13,7 @@ from delo_jax.model.coarse import coarse_pose
 from delo_jax.ops.matching import uniform_marginal
 from delo_jax.ops.transport import partial_transport
 from tests.fixtures import errors
-from tests.oracles.agreement import assert_transforms_agree
+from tests.oracles.agreement import assert_gradient_is_the_slope, assert_transforms_agree
 from tests.oracles.street import pose
 
 CFG, MATCHING = PoseConfig(), MatchingConfig()
@@ -187,3 +187,20 @@ def test_procrustes_on_a_soft_plan_is_the_weighted_fit():
     R = Rotation.align_vectors(matched - y_mean, x - x_mean, weights=weights)[0].as_matrix()
     np.testing.assert_allclose(found.T_target_source[:3, :3], R, atol=1e-4)
     np.testing.assert_allclose(found.T_target_source[:3, 3], y_mean - R @ x_mean, atol=1e-3)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_gradient_is_the_slope(solver):
+    """Oracle: central differences in x64, through plan and points; which match is best does not change within a step."""
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        source = rng.uniform([-20, -20, -1], [20, 20, 5], size=(12, 3))
+        T = pose(1.0, -0.5, 0.1, yaw_deg=10.0)
+        target = source @ T[:3, :3].T + T[:3, 3] + 0.1 * rng.normal(size=source.shape)
+        plan = (0.3 * rng.uniform(size=(12, 12)) + np.eye(12)) / 20.0
+        probe, mask = jnp.asarray(rng.normal(size=(4, 4))), jnp.ones(12, bool)
+
+        def loss(plan, source, target):
+            return jnp.sum(probe * coarse_pose(plan, source, target, mask, cfg=PoseConfig(solver=solver)).T_target_source)
+
+        assert_gradient_is_the_slope(loss, [plan, source, target], rtol=1e-5)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from delo_jax.model.dgcnn import DGCNN
-from tests.oracles.agreement import assert_transforms_agree
+from tests.oracles.agreement import assert_gradient_is_the_slope, assert_transforms_agree
 from tests.oracles.weights import num_weights, random_variables
 
 K, NEIGHBORS, VALID = 24, 5, 19
@@ -93,7 +93,7 @@ def test_training_normalises_over_the_edges_of_the_batch():
 
 
 def test_published_weight_count():
-    """Oracle: the count of the authors' model, audit section 1.10."""
+    """Oracle: the count of the authors' model."""
     points, index, mask = jnp.zeros((4, 3)), jnp.zeros((4, 20), jnp.int32), jnp.ones(4, bool)
     assert num_weights(DGCNN(train=False), points, index, mask) == 309_632
 
@@ -151,3 +151,17 @@ def test_training_gradients_are_finite(sizes):
 
     gradients = jax.jit(jax.grad(loss, argnums=(0, 1)))(VARIABLES["params"], batch[0])
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradients))
+
+
+def test_gradient_is_the_slope():
+    """Oracle: central differences in x64, through the points and a layer's weights, padding included."""
+    with jax.enable_x64(True):
+        points, index, mask = cloud(3)
+        variables = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), VARIABLES)
+        probe = jnp.asarray(np.random.default_rng(1).normal(size=(K, SMALL["embedding_dim"])))
+
+        def loss(points, kernel):
+            params = {**variables["params"], "conv_1": {"kernel": kernel}}
+            return jnp.sum(probe * module().apply({**variables, "params": params}, points, index, mask))
+
+        assert_gradient_is_the_slope(loss, [np.asarray(points, float), variables["params"]["conv_1"]["kernel"]], rtol=1e-5)

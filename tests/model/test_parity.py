@@ -73,7 +73,7 @@ def answer(twin, pair):
 
 
 def test_the_twin_has_the_published_size(twin, published):
-    """Oracle: the counts of the authors' model, audit section 1.10."""
+    """Oracle: the counts of the authors' model."""
     counts = [published.num_weights(module) for module in (twin.encoder, twin.context, twin.evidence)]
     assert counts == [309_632, 5_259_264, 330_632]
 

@@ -78,7 +78,7 @@ def test_training_normalises_over_the_pairs_of_the_batch():
 
 
 def test_published_weight_count():
-    """Oracle: the count of the authors' model, audit section 1.10."""
+    """Oracle: the count of the authors' model."""
     rows, mask = jnp.zeros((4, 512)), jnp.ones(4, bool)
     assert num_weights(PoseEvidenceHead(train=False), rows, rows, mask, mask, jnp.zeros(6)) == 330_632
 

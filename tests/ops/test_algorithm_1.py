@@ -62,7 +62,7 @@ def half_matched(seed):
 def test_printed_loop_makes_row_weights_flat(seed, num_iters):
     """Oracle: POT's optimum selects the rows that have a match, the transcription does not, nor do more rounds help.
 
-    Audit row 3: weights of matched and noise rows 1.19 / 0.81 as printed, 1.93 / 0.07 at the optimum (mean 1).
+    Weights of matched and noise rows 1.19 / 0.81 as printed, 1.93 / 0.07 at the optimum (mean 1).
     """
     cost, share = half_matched(seed)
 

@@ -1,4 +1,4 @@
-"""The published network in PyTorch, in inference mode: written from the audit of the authors' code, apart from ours.
+"""The published network in PyTorch, in inference mode: written from a description of the released code, apart from ours.
 
 One pair of clouds without padding, in float64. Import it only after `pytest.importorskip("torch")`. Linear algebra is
 torch's, neighbours are found here, in float64. `load_*` copy our variables into it; names and layouts are the only
