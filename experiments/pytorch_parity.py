@@ -25,10 +25,10 @@ def main(argv: list[str] | None = None) -> int:
     """Compare, print, judge."""
     args = _harness.parser(__doc__, needs_data=False).parse_args(argv)
     try:
-        from tests.oracles import published
+        from tests.oracles import parity
     except ModuleNotFoundError as error:
         raise ConfigError(f"PyTorch: expected it to be installed, got {error}; run pip install '.[parity,test]'") from error
-    found = {preset: published.compare(preset) for preset in PRESETS}
+    found = {preset: parity.compare(preset) for preset in PRESETS}
     print("| tensor | " + " | ".join(found) + " |\n|---|" + "---:|" * len(found))
     for name in found["paper"]:
         print(f"| {name} | " + " | ".join(f"{by_name[name]:.1e}" if name in by_name else "none" for by_name in found.values()) + " |")

@@ -63,7 +63,9 @@ def twin(published, variables):
 @pytest.fixture(scope="module")
 def pair(published):
     """Source and target points."""
-    return published.street_pair(0)
+    from tests.oracles import parity
+
+    return parity.street_pair(0)
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +172,9 @@ def test_preset_agrees_from_points_to_pose(published, preset):
 
     The plan is soft and the scores are not small, so that neither hides an error of the other.
     """
-    differences = published.compare(preset)
+    from tests.oracles import parity
+
+    differences = parity.compare(preset)
     names = ["features", "embeddings"]
     assert {f"{cloud} {name}" for cloud in ("source", "target") for name in names} | {"scores", "plan", "T_target_source"} <= set(
         differences

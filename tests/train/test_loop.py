@@ -1,81 +1,21 @@
-"""The training run: phases, checkpoints, resumption. The network's own step has its tests; here an exact one stands in."""
+"""The training run: phases, steps, data, what is left out. The network's own step has its tests; here an exact one stands in."""
 
 import dataclasses
 import logging
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from delo_jax.errors import ConfigError
-from delo_jax.model import delo
 from delo_jax.train import loop
 from delo_jax.train.presets import PRESETS
-from delo_jax.train.step import TrainState
-from tests.fixtures import TINY_TRAINING, street_world, tiny_model
+from tests.fixtures import street_world
+from tests.train.exact_step import CFG, Reporter, as_bytes, failing_at, stand_ins
 
-CFG = dataclasses.replace(TINY_TRAINING, num_steps=11, num_evidence_steps=10, validate_every=4, num_frames=3, batch_size=1)
-
-
-class Reporter:
-    """Writes everything down; raises what it is told to after so many steps."""
-
-    def __init__(self, stop_after=None, error=KeyboardInterrupt):
-        self.pieces, self.notes, self.validations = [], [], []
-        self._stop_after, self._error = stop_after, error
-
-    def start(self, what, total, done=0):
-        self.pieces.append((what, total, done))
-
-    def advance(self, note=""):
-        self.notes += [note] if note else []
-        if self._stop_after is not None and len(self.notes) == self._stop_after:
-            raise self._error
-
-    def validated(self, step, errors):
-        self.validations.append(step)
-
-
-@pytest.fixture(autouse=True)
-def stand_ins(monkeypatch):
-    """Two street worlds, no validation, weights made before, and a step that any slip would change for good.
-
-    It depends on the batch, on the optimiser's memory and on the phase, and forgets nothing.
-    """
-
-    def make_train_step(cfg, tx):
-        phase = 1.0 if cfg.evidence_weight else -1.0
-
-        def train_step(state, batch):
-            pull = phase * jnp.mean(batch.T_init) + jnp.sum(batch.source.points) * 1e-3 + state.step
-            params = state.variables["params"]
-            updates, opt_state = tx.update(jax.tree.map(lambda leaf: leaf + pull, params), state.opt_state, params)
-            variables = {
-                "params": optax.apply_updates(params, updates),
-                "batch_stats": {"mean": state.variables["batch_stats"]["mean"] + pull},
-            }
-            return TrainState(variables, opt_state, state.step + 1, state.num_nonfinite), {"loss": pull}
-
-        return jax.jit(train_step, donate_argnums=0)
-
-    def worlds(cfg, folder, *, validation, on_world):
-        for _ in range(cfg.num_validation_scenes if validation else cfg.num_scenes):
-            yield street_world(cfg.model.preprocess, cfg.num_frames)
-            on_world()
-
-    monkeypatch.setattr(loop, "make_train_step", make_train_step)
-    monkeypatch.setattr(loop, "worlds", worlds)
-    monkeypatch.setattr(loop, "validate", lambda model, held_out: [])
-    params = {"a": jnp.ones(3), "b": {"c": jnp.arange(4.0)}}
-    weights = delo.Model({"params": params, "batch_stats": {"mean": jnp.zeros(2)}}, tiny_model().cfg)
-    monkeypatch.setattr(delo, "init", lambda cfg, key: delo.Model(jax.tree.map(jnp.array, weights.variables), cfg))
-
-
-def as_bytes(model):
-    return b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(model))
+__all__ = ["stand_ins"]  # a fixture
+pytestmark = pytest.mark.usefixtures("stand_ins")
 
 
 def test_run_goes_through_its_pieces(tmp_path):
@@ -148,23 +88,6 @@ def test_phase_without_a_loss_is_left_out(tmp_path, weights, pieces, num_steps):
     assert len(reporter.notes) == num_steps
 
 
-def failing_at(steps):
-    """A stand-in that leaves out these steps and counts them, as the real one does."""
-    make_train_step = loop.make_train_step
-
-    def make_failing(cfg, tx):
-        train_step = make_train_step(cfg, tx)
-
-        def failing(state, batch):
-            if int(state.step) in steps:
-                return state._replace(step=state.step + 1, num_nonfinite=state.num_nonfinite + 1), {"loss": jnp.float32(np.nan)}
-            return train_step(state, batch)
-
-        return failing
-
-    return make_failing
-
-
 def test_steps_left_out_are_counted_and_reported(tmp_path, monkeypatch, caplog):
     """Oracle: by hand; the third and fifth of the first phase, the second of the second phase."""
     monkeypatch.setattr(loop, "make_train_step", failing_at({2, 4, 12}))
@@ -178,17 +101,6 @@ def test_steps_left_out_are_counted_and_reported(tmp_path, monkeypatch, caplog):
     assert reporter.notes[4].endswith(", 2 not finite")
     assert [record.getMessage() for record in caplog.records] == ["3 of 21 steps were left out: loss or gradient was not finite"]
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(loop.train(CFG, tmp_path, Reporter())[0]))
-
-
-def test_left_out_steps_are_counted_across_an_interruption(tmp_path, monkeypatch):
-    """Oracle: the count of the run that nobody interrupted."""
-    monkeypatch.setattr(loop, "make_train_step", failing_at({2, 4, 12}))
-    _, _, expected = loop.train(CFG, tmp_path / "whole", Reporter())
-    for stop_after in (7, 9):  # within the first phase, within the second
-        with pytest.raises(KeyboardInterrupt):
-            loop.train(CFG, tmp_path / "other", Reporter(stop_after))
-    _, _, found = loop.train(CFG, tmp_path / "other", Reporter())
-    assert found == expected == 3
 
 
 def test_training_that_goes_nowhere_stops(tmp_path, monkeypatch):
@@ -253,91 +165,6 @@ def test_batch_that_does_not_divide_over_the_devices(tmp_path, monkeypatch):
         loop.train(CFG, tmp_path / "out", reporter)
     assert reporter.pieces == []
     assert not (tmp_path / "out").exists()
-
-
-@pytest.fixture(scope="module")
-def whole_run():
-    """Bytes of the run that nobody interrupted, made by the first test that asks."""
-    return {}
-
-
-def uninterrupted(whole_run, folder):
-    if not whole_run:
-        whole_run["bytes"] = as_bytes(loop.train(CFG, folder / "whole", Reporter())[0])
-    return whole_run["bytes"]
-
-
-@pytest.mark.parametrize(
-    ("stop_after", "error"),
-    [
-        (1, KeyboardInterrupt),
-        (8, KeyboardInterrupt),
-        (11, KeyboardInterrupt),
-        (18, KeyboardInterrupt),
-        (8, RuntimeError),
-        (18, RuntimeError),
-    ],
-)
-def test_interrupted_run_ends_where_the_other_does(tmp_path, whole_run, stop_after, error):
-    """Oracle: the run that nobody interrupted, byte by byte; Ctrl-C loses no step, a crash those since the last checkpoint."""
-    with pytest.raises(error):
-        loop.train(CFG, tmp_path, Reporter(stop_after, error))
-    second = Reporter()
-    found, _, _ = loop.train(CFG, tmp_path, second)
-    assert as_bytes(found) == uninterrupted(whole_run, tmp_path)
-    if error is KeyboardInterrupt:
-        assert len(second.notes) == 21 - stop_after
-    else:  # a step is reported before its checkpoint is written
-        last = max(step for step in (0, 4, 8, 11, 12, 16, 20) if step < stop_after)
-        assert len(second.notes) == 21 - last
-
-
-@pytest.mark.parametrize("moment", ["within a step", "after a step"])
-def test_ctrl_c_at_the_worst_moment(tmp_path, whole_run, monkeypatch, moment):
-    """Oracle: the run that nobody interrupted. The step has taken the old state and not yet given the new one, or is not yet counted."""
-    make_train_step = loop.make_train_step
-
-    class Loss:
-        def __float__(self):
-            raise KeyboardInterrupt
-
-    def make_interrupted(cfg, tx):
-        train_step = make_train_step(cfg, tx)
-
-        def interrupted(state, batch):
-            number = int(state.step)
-            state, metrics = train_step(state, batch)
-            if number == 5 and moment == "within a step":
-                raise KeyboardInterrupt
-            return state, {"loss": Loss()} if number == 5 else metrics
-
-        return interrupted
-
-    with monkeypatch.context() as patch:
-        patch.setattr(loop, "make_train_step", make_interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            loop.train(CFG, tmp_path, Reporter())
-    second = Reporter()
-    assert as_bytes(loop.train(CFG, tmp_path, second)[0]) == uninterrupted(whole_run, tmp_path)
-    assert second.pieces[2] == ("learning poses", 11, 4 if moment == "within a step" else 6)
-
-
-def test_finished_run_is_only_read(tmp_path):
-    """Oracle: the first run's weights; not one step more."""
-    first, _, _ = loop.train(CFG, tmp_path, Reporter())
-    reporter = Reporter()
-    again, _, _ = loop.train(CFG, tmp_path, reporter)
-    assert as_bytes(again) == as_bytes(first)
-    assert reporter.notes == []
-    assert reporter.pieces[-2:] == [("learning poses", 11, 11), ("learning evidence", 10, 10)]
-
-
-def test_checkpoints_of_another_config_are_refused(tmp_path):
-    """Oracle: the sentence; training goes on from what it was, or not at all."""
-    loop.train(CFG, tmp_path, Reporter())
-    other = dataclasses.replace(CFG, learning_rate=1e-3)
-    with pytest.raises(ConfigError, match="checkpoints: expected checkpoints of this config, got those of another; choose another --out"):
-        loop.train(other, tmp_path, Reporter())
 
 
 def test_phase_without_steps_is_left_out(tmp_path):
