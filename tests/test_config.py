@@ -113,6 +113,7 @@ def test_wrong_type_is_refused(table, message):
         (PreprocessConfig, {"sampling": "raw"}),  # 384 key points of 3072 points
         (EncoderConfig, {"kind": "pointnet"}),
         (EncoderConfig, {"edges": "both"}),
+        (EncoderConfig, {"edges": "absolute"}),  # edge_conv has relative ones only
         (EncoderConfig, {"num_neighbors": 0}),
         (EncoderConfig, {"edge_scale_m": 0.0}),
         (EncoderConfig, {"position_scale_m": float("nan")}),
@@ -127,6 +128,7 @@ def test_wrong_type_is_refused(table, message):
         (MatchingConfig, {"num_iters": 0}),
         (MatchingConfig, {"epsilon": 0.0}),
         (MatchingConfig, {"epsilon": 0.01, "learn_epsilon": True}),
+        (MatchingConfig, {"plan": "softmax", "predict_mass": True}),  # which has no mass
         (MatchingConfig, {"num_candidates": 0}),
         (MatchingConfig, {"marginal_weight": -1.0}),
         (PoseConfig, {"solver": "ransac"}),
@@ -143,6 +145,8 @@ def test_wrong_type_is_refused(table, message):
         (StatusConfig, {"rejected_confidence": 0.9}),
         (DeloConfig, {"encoder": EncoderConfig(num_neighbors=400)}),
         (DeloConfig, {"attention": AttentionConfig(num_heads=3)}),  # of 64 channels
+        (DeloConfig, {"attention": AttentionConfig(num_heads=4)}),  # cosines of descriptors that are not unit
+        (DeloConfig, {"encoder": EncoderConfig(kind="dgcnn")}),
         (DeloConfig, RAW | {"encoder": EncoderConfig(), "fine": FineConfig(num_iters=0), "evidence": EvidenceConfig(head="none")}),
         (DeloConfig, RAW | {"evidence": EvidenceConfig(head="none")}),  # a fine stage without normals
         (DeloConfig, RAW | {"fine": FineConfig(num_iters=0)}),  # statistics of no fine stage
@@ -150,6 +154,7 @@ def test_wrong_type_is_refused(table, message):
         (TrainConfig, {"num_scenes": 0}),
         (TrainConfig, {"num_validation_scenes": 0}),
         (TrainConfig, {"batch_size": 0}),
+        (TrainConfig, {"model": PRESETS["paper"].model, "fine_weight": 0.0, "batch_size": 1}),  # batch norm of one
         (TrainConfig, {"num_points": 0}),
         (TrainConfig, {"learning_rate": 0.0}),
         (TrainConfig, {"learning_rate": float("nan")}),

@@ -6,6 +6,7 @@ import shlex
 import sys
 import time
 from importlib.metadata import version
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -107,7 +108,7 @@ def print_errors(title: str, errors: "list[GapErrors]") -> None:
     header = "gap", "pairs", "median cm", "p95 cm", "median deg", "lost %", "false alarms %", "missed %"
     rows = [
         (str(row.gap), str(row.num_pairs), f"{row.median_cm:.1f}", f"{row.p95_cm:.1f}", f"{row.median_deg:.3f}")
-        + tuple(f"{100 * share:.1f}" for share in (row.lost_share, row.false_alarm_share, row.missed_share))
+        + tuple("" if isnan(share) else f"{100 * share:.1f}" for share in (row.lost_share, row.false_alarm_share, row.missed_share))
         for row in errors
     ]
     print_table(title, header, rows, right=range(len(header)))
@@ -129,7 +130,7 @@ def card(cfg: config.TrainConfig, command: str, errors: "list[GapErrors]", num_n
         "commands": [command],
         "training": config_table(cfg),
         "steps left out as not finite": num_nonfinite,
-        "metrics": [row._asdict() for row in errors],
+        "metrics": [{name: value for name, value in row._asdict().items() if not isnan(value)} for row in errors],
         "versions": {"delo-jax": __version__, "python": platform.python_version(), **{name: version(name) for name in names}},
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "license": "that of the recorded data" if cfg.recorded else "MIT",

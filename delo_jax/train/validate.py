@@ -23,15 +23,15 @@ class GapErrors(NamedTuple):
     p95_cm: float
     median_deg: float
     lost_share: float  # off by more than the config's limits
-    false_alarm_share: float  # of the pairs not lost: confidence below ok
-    missed_share: float  # of the lost pairs: confidence ok
+    false_alarm_share: float  # of the pairs not lost: confidence below ok; NaN without an evidence head
+    missed_share: float  # of the lost pairs: confidence ok; NaN without an evidence head
 
 
 def validate(model: delo.Model, worlds: list[World]) -> list[GapErrors]:
     """Errors at gaps 1, 2, 3 and 5, as far as the worlds go, no motion prior, from every fifth frame of every world."""
     rows = []
     gaps = [gap for gap in GAPS if gap < min(len(world.Ts_world_lidar) for world in worlds)]
-    limits = model.cfg.status
+    limits, judges = model.cfg.status, model.cfg.evidence.head != "none"
     errors_of: dict[int, list] = {gap: [] for gap in gaps}
     for world in worlds:
         for first in range(0, len(world.Ts_world_lidar) - gaps[-1], gaps[-1]):
@@ -53,8 +53,8 @@ def validate(model: delo.Model, worlds: list[World]) -> list[GapErrors]:
                 100 * float(np.percentile(translation, 95)),
                 float(np.degrees(np.median(rotation))),
                 float(lost.mean()),
-                float((~ok & ~lost).sum() / max((~lost).sum(), 1)),
-                float((ok & lost).sum() / max(lost.sum(), 1)),
+                float((~ok & ~lost).sum() / max((~lost).sum(), 1)) if judges else np.nan,
+                float((ok & lost).sum() / max(lost.sum(), 1)) if judges else np.nan,
             )
         )
     return rows

@@ -44,6 +44,18 @@ def test_sequences_are_part_of_the_config(cli, recordings):
     assert tomllib.loads(cli("train", "paper", "--dump-config").out)["recorded"] == ""
 
 
+def test_sequences_of_a_config_stand_unless_others_are_named(cli, recordings, tmp_path):
+    """Oracle: the order option, file, default; sequences without a tree are refused with one sentence."""
+    text = config.to_toml(dataclasses.replace(PRESETS["paper"], recorded="01"))
+    (tmp_path / "config.toml").write_text(text)
+    for options, expected in (((), "01"), (("--sequences", "00"), "00")):
+        done = cli("train", tmp_path / "config.toml", "--data", recordings, *options, "--dump-config")
+        assert tomllib.loads(done.out)["recorded"] == expected
+    alone = cli("train", "paper", "--sequences", "00", "--dump-config")
+    assert alone.code == 2
+    assert "--sequences: expected a tree to find them in, got none; add --data DIR" in alone.err
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_can_be_named(preset, cli):
     """Oracle: the table of presets."""
@@ -82,7 +94,8 @@ def test_card_tells_of_the_recordings(cli, monkeypatch, tmp_path, recordings, we
     assert cli("train", "paper", "--data", recordings, "--sequences", "01", "--out", out).code == 0
     assert calls == [(dataclasses.replace(PRESETS["paper"], recorded="01"), out, recordings)]
     card = weights.read_card(out / "delo-paper.safetensors")
-    assert card["data"] == "recorded sequences 01, the last tenth of each for validation; no simulated data"
+    assert card["data"] == "recorded sequences 01, the last tenth of each for validation, KITTI's elevation lifted by 0.205 deg"
+    assert card["license"] == "that of the recorded data"
     assert card["seeds"] == {"base": 0}
     assert card["training"]["recorded"] == "01"
     assert card["commands"] == [f"delo train paper --out {out} --data {recordings} --sequences 01"]
