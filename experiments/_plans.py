@@ -1,7 +1,10 @@
 """Plans and poses of a trained matcher, measured: what its plan looks like, and where each pose solver ends on it."""
 
+import hashlib
+import os
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import _pairs
@@ -70,6 +73,22 @@ def describe(plan, source: delo.Encoding, target: delo.Encoding, T_true) -> Plan
 def rows_of(tree: Any, rows: np.ndarray) -> Any:
     """These rows of every array."""
     return jax.tree.map(lambda array: array[rows], tree)
+
+
+def remembered(model: delo.Model, both: Pairs, folder: Path) -> tuple[PlanNumbers, np.ndarray]:
+    """`measure_all`, kept in `folder` under a name that says what was measured, so that a study that goes on measures nothing twice."""
+    content = hashlib.sha256(repr(model.cfg).encode())
+    for array in (*jax.tree.leaves(jax.device_get(model.variables)), *both.frames, *both[1:]):
+        content.update(np.ascontiguousarray(array).tobytes())
+    path = folder / f"measured_{content.hexdigest()[:16]}.npz"
+    if not path.exists():
+        numbers, errors = measure_all(model, both)
+        folder.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(f".{os.getpid()}.part.npz")
+        np.savez(part, **numbers._asdict(), errors=errors)
+        part.replace(path)
+    with np.load(path) as stored:
+        return PlanNumbers(*(stored[name] for name in PlanNumbers._fields)), stored["errors"]
 
 
 def measure_all(model: delo.Model, both: Pairs, size: int = 100) -> tuple[PlanNumbers, np.ndarray]:

@@ -23,7 +23,7 @@ import jax
 import numpy as np
 from _harness import Row
 from _pairs import Pairs
-from _plans import PlanNumbers, interval, lost, measure_all, timing
+from _plans import PlanNumbers, interval, lost, remembered, timing
 
 from delo_jax import weights
 from delo_jax.config import SOLVERS, DeloConfig, MatchingConfig, PoseConfig, TrainConfig
@@ -142,7 +142,7 @@ def swap(model: delo.Model, **changes: Any) -> delo.Model:
     return delo.Model(model.variables, replace(model.cfg, matching=replace(model.cfg.matching, **changes)))
 
 
-def sweep(models: list[delo.Model], sets: dict) -> None:
+def sweep(models: list[delo.Model], sets: dict, folder: Path) -> None:
     """Mass, entropic weight and iterations of exact partial transport on its frozen scores."""
     print(f"\n### Exact partial OT on frozen scores, gap 3: lost % with {', '.join(SOLVERS)}\n")
     head = " | ".join(f"{name}: {' / '.join(SOLVERS)}" for name in ("unseen worlds", "half overlap"))
@@ -152,7 +152,7 @@ def sweep(models: list[delo.Model], sets: dict) -> None:
     for variant in variants:
         cells = []
         for name in ("unseen worlds", "half overlap"):
-            errors = np.stack([measure_all(swap(model, **variant), sets[name][3])[1] for model in models])
+            errors = np.stack([remembered(swap(model, **variant), sets[name][3], folder)[1] for model in models])
             cells.append(" / ".join(f"{100 * lost(errors)[:, :, number].mean():.1f}" for number in range(len(SOLVERS))))
         print(f"| {variant['mass']:g} | {variant['epsilon']:g} | {variant['num_iters']} | " + " | ".join(cells) + " |", flush=True)
 
@@ -162,7 +162,7 @@ def share_lost(results: dict, condition: str, source: str, gap: int, solver: str
     return 100.0 * float(lost(results[condition][source][gap][1][:, :, SOLVERS.index(solver)]).mean())
 
 
-def collect(models: dict[str, list[delo.Model]], sets: dict, bar) -> dict:
+def collect(models: dict[str, list[delo.Model]], sets: dict, folder: Path, bar) -> dict:
     """condition -> source -> gap -> (numbers of the plans, errors (seeds, pairs, solvers, 2))."""
     results: dict = {condition: {source: {} for source in models} for condition in sets}
     task = bar.add_task("testing", total=sum(map(len, models.values())) * len(sets) * len(GAPS))
@@ -171,7 +171,7 @@ def collect(models: dict[str, list[delo.Model]], sets: dict, bar) -> dict:
             for gap, both in by_gap.items():
                 measured = []
                 for model in of_seeds:
-                    measured.append(measure_all(model, both))
+                    measured.append(remembered(model, both, folder))
                     bar.advance(task)
                 numbers = PlanNumbers(*(np.stack(values) for values in zip(*(m[0] for m in measured), strict=True)))
                 results[condition][source][gap] = numbers, np.stack([m[1] for m in measured])
@@ -248,7 +248,7 @@ def main(argv: list[str] | None = None) -> int:
         worlds, _ = loop.load_worlds(base, args.out / "worlds", _harness.BarReporter(bar), None)
         models, num_nonfinite = from_scratch(worlds, settings, out, bar)
         sets = test_sets(args.data, settings, args.out, bar)
-        results = collect(models, sets, bar)
+        results = collect(models, sets, args.out / "measured", bar)
         print_results(results, sets, settings)
         best = best_partial(results)
         print(f"\nBest partial transport on unseen worlds with the consistency solver: {best}\n")
@@ -256,8 +256,8 @@ def main(argv: list[str] | None = None) -> int:
         retrained, skipped = end_to_end(
             models, [*runs, ("exact partial OT", "procrustes"), ("softmax", "procrustes")], worlds, settings, out, bar
         )
-        print_results(collect(retrained, sets, bar), sets, settings)
-        sweep(models["exact partial OT"], sets)
+        print_results(collect(retrained, sets, args.out / "measured", bar), sets, settings)
+        sweep(models["exact partial OT"], sets, args.out / "measured")
         timing({name: of_seeds[0] for name, of_seeds in models.items()}, sets["recorded"][3])
     return _harness.finish(judge(results, sets, num_nonfinite + skipped), dataclasses.asdict(settings), args)
 

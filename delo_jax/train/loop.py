@@ -96,7 +96,7 @@ def _mesh(cfg: TrainConfig) -> Mesh:
 
 def _fit(cfg, training, held_out, start_from, mesh, checkpoints, reporter) -> tuple[delo.Model, int]:
     """All phases; returns the model and the number of steps left out."""
-    variables, first, num_nonfinite = start_from.variables, 0, 0
+    variables, first, num_nonfinite = jax.tree.map(jnp.copy, start_from.variables), 0, 0  # a step takes its state's memory
     for phase_cfg, num_steps in phases(cfg, count_steps(cfg, training)):
         if num_steps:
             counts = first, num_nonfinite

@@ -34,6 +34,18 @@ def test_run_goes_through_its_pieces(tmp_path):
     assert reporter.validations == [4, 8, 11, 12, 16, 20, 21]
 
 
+def test_fit_starts_from_given_weights_and_leaves_them(tmp_path):
+    """Oracle: repetition from the same weights gives the same bytes; nothing is validated without worlds to do it on."""
+    worlds = [street_world(CFG.model.preprocess, CFG.num_frames)]
+    begin, reporter = delo.init(CFG.model, jax.random.key(0)), Reporter()
+    before = as_bytes(begin)
+    runs = [loop.fit(CFG, worlds, [], begin, tmp_path / str(number), reporter) for number in range(2)]
+    assert as_bytes(begin) == before
+    assert as_bytes(runs[0][0]) == as_bytes(runs[1][0]) != before
+    assert [num_nonfinite for _, num_nonfinite in runs] == [0, 0]
+    assert reporter.validations == []
+
+
 def test_phases_switch_the_losses():
     """Oracle: by hand; first all but the evidence, then the evidence alone."""
     (pose, num_pose), (evidence, num_evidence) = loop.phases(CFG, 11)
