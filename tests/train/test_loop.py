@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from delo_jax.errors import ConfigError
+from delo_jax.model import delo
 from delo_jax.train import loop
 from delo_jax.train.presets import PRESETS
 from tests.fixtures import street_world
