@@ -12,9 +12,11 @@ import numpy as np
 from rich.progress import Progress
 
 import delo_jax
+from delo_jax import inference
 from delo_jax.config import PreprocessConfig
 from delo_jax.data import camera_to_lidar, read_kitti_poses
 from delo_jax.geometry import se3
+from delo_jax.model import delo
 from delo_jax.preprocess import Scan, preprocess
 from delo_jax.sim import KINDS, simulate_clip
 from delo_jax.train.worlds import SIMULATOR
@@ -121,6 +123,17 @@ def _sector(scan: Scan, heading: float) -> Scan:
     mask = inside[order]
     points, normals, features = (np.where(mask[:, None], array[order], 0).astype(np.float32) for array in scan[:3])
     return Scan(points, normals, features, mask, scan.keypoint_index, mask)
+
+
+def encoded_pairs(models: dict[str, delo.Model], seed: int, num_worlds: int, gaps: tuple[int, ...], bar: Progress) -> Iterator[tuple]:
+    """(gap, T_target_source, encodings of source and target by model) of all pairs, source first, of six-frame clips."""
+    for index in bar.track(range(num_worlds), description="unseen clips"):
+        clip = simulate_clip(KINDS[index % len(KINDS)], seed + index)
+        encodings = {name: [inference.encode(m, preprocess(scan.points, m.cfg.preprocess)) for scan in clip] for name, m in models.items()}
+        for gap in gaps:
+            for k in range(len(clip) - gap):
+                T = se3.inverse(clip[k + gap].T_world_lidar) @ clip[k].T_world_lidar
+                yield gap, T, {name: (scans[k], scans[k + gap]) for name, scans in encodings.items()}
 
 
 def in_pieces(count: int, size: int) -> Iterator[np.ndarray]:

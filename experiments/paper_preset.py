@@ -14,10 +14,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import _harness
+import _pairs
 import jax
 import jax.numpy as jnp
 import numpy as np
 from _harness import Row
+from _plans import LOST_DEG, LOST_M
 from matplotlib.figure import Figure
 
 import delo_jax
@@ -26,15 +28,12 @@ from delo_jax.config import DeloConfig, TrainConfig
 from delo_jax.geometry import se3
 from delo_jax.metrics.registration import pose_errors
 from delo_jax.model import delo
-from delo_jax.preprocess import preprocess
-from delo_jax.sim import KINDS, simulate_clip
 from delo_jax.train import loop
 from delo_jax.train.presets import PRESETS
 from delo_jax.train.worlds import World
 
 TEST_SEED = 2_500_000  # training and validation worlds of any run begin at whole millions
 GAPS = (1, 3)
-LOST_M, LOST_DEG = 0.5, 2.0
 GAIN = 0.7  # of the better of identity and mean motion
 
 
@@ -89,16 +88,11 @@ def test_pairs(models: dict[str, delo.Model], num_worlds: int, bar) -> tuple[dic
     """Estimates of each model, and the truth, by gap: all pairs (k, k + gap) of six-frame clips, source first."""
     estimates: dict = {name: {gap: [] for gap in GAPS} for name in models}
     true: dict = {gap: [] for gap in GAPS}
-    for index in bar.track(range(num_worlds), description="testing"):
-        clip = simulate_clip(KINDS[index % len(KINDS)], TEST_SEED + index)
-        poses = np.stack([scan.T_world_lidar for scan in clip])
-        encodings = {name: [inference.encode(m, preprocess(scan.points, m.cfg.preprocess)) for scan in clip] for name, m in models.items()}
-        for gap in GAPS:
-            for k in range(len(clip) - gap):
-                true[gap].append(se3.inverse(poses[k + gap]) @ poses[k])
-                for name, model in models.items():
-                    answer = inference.solve(model, encodings[name][k], encodings[name][k + gap], jnp.eye(4))
-                    estimates[name][gap].append(np.asarray(answer.T_target_source, np.float64))
+    for gap, T_true, encodings in _pairs.encoded_pairs(models, TEST_SEED, num_worlds, GAPS, bar):
+        true[gap].append(T_true)
+        for name, ends in encodings.items():
+            answer = inference.solve(models[name], *ends, jnp.eye(4))
+            estimates[name][gap].append(np.asarray(answer.T_target_source, np.float64))
     return estimates, true
 
 
@@ -110,8 +104,8 @@ def median_with_interval(values: np.ndarray) -> tuple[float, str]:
     return median, f"{median:.3g} [{np.percentile(draws, 2.5):.3g}, {np.percentile(draws, 97.5):.3g}]"
 
 
-def compare(estimates: dict, true: dict) -> tuple[dict, list[Row]]:
-    """Print the table; medians by method and gap, and the bounds."""
+def compare(estimates: dict, true: dict) -> list[Row]:
+    """Print the table of methods and gaps; the bounds."""
     print("\n| gap | pairs | method | median cm [95 %] | median deg [95 %] | lost % |\n|---:|---:|---|---:|---:|---:|")
     medians: dict = {}
     for gap in GAPS:
@@ -128,7 +122,7 @@ def compare(estimates: dict, true: dict) -> tuple[dict, list[Row]]:
         for number, unit in enumerate(("cm", "deg")):
             better = min(medians[name, gap][number] for name in ("identity", "mean motion"))
             rows.append(Row(f"paper preset, gap {gap}, median", medians["paper", gap][number], unit, GAIN * better))
-    return medians, rows
+    return rows
 
 
 def learning_curve(validations: dict[int, list[dict]], file: Path) -> None:
@@ -174,7 +168,7 @@ def main(argv: list[str] | None = None) -> int:
     }
     print(f"paper preset with D = {settings.width}, N = {settings.num_points}: {describe(cfg.model)}")
     learning_curve(reporter.validations, out / "learning_curve.png")
-    _, rows = compare(constant | estimates, true)
+    rows = compare(constant | estimates, true)
     rows.append(Row("training steps left out as not finite", float(num_nonfinite), "", 0.0))
     return _harness.finish(rows, dataclasses.asdict(settings), args)
 

@@ -137,6 +137,22 @@ def print_results(results: dict, sets: dict, settings: Settings) -> None:
             print(f"| {source} | {variation:.2f} | {100 * inliers:.0f} | {100 * sharpness:.0f} | {100 * excess:.0f} |")
 
 
+def print_differences(results: dict, sets: dict) -> None:
+    """How much less each source loses than softmax does on the same pairs, under the consistency solver."""
+    number = SOLVERS.index("consistency")
+    print("\n### Lost % with the consistency solver, minus that of softmax on the same pairs\n")
+    cells = [(condition, gap) for condition in results for gap in GAPS[1:]]
+    print("| matching | " + " | ".join(f"{condition}, gap {gap}" for condition, gap in cells) + " |\n|---|" + "---:|" * len(cells))
+    for source in list(SOURCES)[1:]:
+        texts = []
+        for condition, gap in cells:
+            shares = [100.0 * lost(results[condition][name][gap][1][:, :, number]) for name in (source, "softmax")]
+            difference = shares[0] - shares[1]
+            low, high = interval(difference, sets[condition][gap].group, np.mean)
+            texts.append(f"{difference.mean():.1f} [{low:.1f}, {high:.1f}]")
+        print(f"| {source} | " + " | ".join(texts) + " |")
+
+
 def swap(model: delo.Model, **changes: Any) -> delo.Model:
     """The same weights with other settings of the matching."""
     return delo.Model(model.variables, replace(model.cfg, matching=replace(model.cfg.matching, **changes)))
@@ -250,6 +266,7 @@ def main(argv: list[str] | None = None) -> int:
         sets = test_sets(args.data, settings, args.out, bar)
         results = collect(models, sets, args.out / "measured", bar)
         print_results(results, sets, settings)
+        print_differences(results, sets)
         best = best_partial(results)
         print(f"\nBest partial transport on unseen worlds with the consistency solver: {best}\n")
         runs = [(name, "consistency") for name in dict.fromkeys([best, "exact partial OT", "softmax"])]

@@ -13,20 +13,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import _harness
+import _pairs
 import jax
 import jax.numpy as jnp
 import numpy as np
 from _harness import Row
+from _plans import describe
 from matplotlib.figure import Figure
 
 import delo_jax
-from delo_jax import inference
 from delo_jax.geometry import se3
 from delo_jax.model import delo
-from delo_jax.ops.matching import uniform_marginal
-from delo_jax.ops.transport import marginal_excess
-from delo_jax.preprocess import preprocess
-from delo_jax.sim import KINDS, simulate_clip
 
 TEST_SEED = 2_500_000  # that of paper_preset.py
 GAPS = (1, 3)
@@ -48,33 +45,22 @@ def features(model: delo.Model, num_worlds: int, bar) -> list:
     """(source, target, descriptors of both in context, T_target_source, gap) of all pairs of unseen clips."""
     in_context = jax.jit(lambda source, target: delo.match(model, source, target)[:2])
     found = []
-    for index in bar.track(range(num_worlds), description="features"):
-        clip = simulate_clip(KINDS[index % len(KINDS)], TEST_SEED + index)
-        encodings = [inference.encode(model, preprocess(scan.points, model.cfg.preprocess)) for scan in clip]
-        for gap in GAPS:
-            for k in range(len(clip) - gap):
-                T = se3.inverse(clip[k + gap].T_world_lidar) @ clip[k].T_world_lidar
-                pair = encodings[k], encodings[k + gap]
-                found.append((*pair, *in_context(*pair), T, gap))
+    for gap, T, encodings in _pairs.encoded_pairs({"paper": model}, TEST_SEED, num_worlds, GAPS, bar):
+        found.append((*encodings["paper"], *in_context(*encodings["paper"]), T, gap))
     return found
 
 
 def evaluate(model: delo.Model, pairs: list) -> dict[int, np.ndarray]:
-    """Per gap, rows of: error [cm], error [deg], variation of the row sums, sharpness, excess of the marginals."""
+    """Per gap, rows of: error [cm], error [deg], then the plan's numbers as in `_plans.PlanNumbers`."""
 
     @jax.jit
-    def one(source, target, ours, theirs):
-        masks = source.keypoint_mask, target.keypoint_mask
-        plan = model.apply("plan", ours, theirs, *masks)
-        rows, total = jnp.sum(plan, axis=1), jnp.sum(plan)
-        mean = total / jnp.sum(masks[0])
-        variation = jnp.sqrt(jnp.sum(jnp.where(masks[0], (rows - mean) ** 2, 0.0)) / jnp.sum(masks[0])) / mean
-        numbers = variation, jnp.sum(jnp.max(plan, axis=1)) / total, marginal_excess(plan, *map(uniform_marginal, masks))
-        return delo.coarse(model, source, target, plan).T_target_source, jnp.stack(numbers)
+    def one(source, target, ours, theirs, T_true):
+        plan = model.apply("plan", ours, theirs, source.keypoint_mask, target.keypoint_mask)
+        return delo.coarse(model, source, target, plan).T_target_source, jnp.stack(describe(plan, source, target, T_true))
 
     rows: dict[int, list] = {gap: [] for gap in GAPS}
     for *arguments, T_true, gap in pairs:
-        T, numbers = one(*arguments)
+        T, numbers = one(*arguments, T_true.astype(np.float32))
         error = se3.inverse(np.asarray(T, np.float64)) @ T_true
         cm, deg = 100 * np.linalg.norm(error[:3, 3]), np.degrees(se3.rotation_angle(error[:3, :3]))
         rows[gap].append([cm, deg, *np.asarray(numbers)])
@@ -106,21 +92,22 @@ def main(argv: list[str] | None = None) -> int:
     with _harness.progress() as bar:
         pairs = features(model, settings.num_worlds, bar)
         task = bar.add_task("sweep", total=len(settings.masses) * len(settings.rounds))
-        print(f"| m | xi | {head} | row-weight variation | sharpness % | largest excess % |\n|---:|---:|{'---:|' * 7}")
+        print(f"| m | xi | {head} | row-weight variation | inlier mass % | sharpness % | largest excess % |\n|---:|---:|{'---:|' * 8}")
         for mass in settings.masses:
             for rounds in settings.rounds:
                 matching = replace(model.cfg.matching, mass=mass, num_iters=rounds)
                 errors = evaluate(delo.Model(model.variables, replace(model.cfg, matching=matching)), pairs)
                 medians[mass, rounds] = {gap: np.median(values, axis=0) for gap, values in errors.items()}
                 cells = " | ".join(f"{medians[mass, rounds][gap][0]:.0f} | {medians[mass, rounds][gap][1]:.2f}" for gap in GAPS)
-                variation, sharpness, excess = medians[mass, rounds][1][2:]
-                print(f"| {mass:g} | {rounds} | {cells} | {variation:.2f} | {100 * sharpness:.0f} | {100 * excess:.1f} |", flush=True)
+                variation, *shares = medians[mass, rounds][1][2:]
+                numbers = " | ".join([f"{variation:.2f}", *(f"{100 * share:.1f}" for share in shares)])
+                print(f"| {mass:g} | {rounds} | {cells} | {numbers} |", flush=True)
                 bar.advance(task)
     draw(medians, settings, args.weights.with_name("transport_sweep.png"))
     most = max(settings.rounds)
     rows = [
         Row(f"row-weight variation at m = 1, xi = {most}: a balanced plan refuses nothing", float(medians[1.0, most][1][2]), "", 0.05),
-        Row(f"median excess of a cap at m = 0.1, xi = {most}", 100 * float(medians[0.1, most][1][4]), "%", 1.0),
+        Row(f"median excess of a cap at m = 0.1, xi = {most}", 100 * float(medians[0.1, most][1][5]), "%", 1.0),
     ]
     return _harness.finish(rows, dataclasses.asdict(settings), args)
 
