@@ -81,8 +81,8 @@ def preprocess(points: np.ndarray, cfg: PreprocessConfig) -> Scan:
 
 
 def _raw_scan(points: np.ndarray, cfg: PreprocessConfig, rng: np.random.Generator) -> Scan:
-    """Evenly spaced rows of the sweep as they are, in random order, every one a key point (Ali et al. 2023, Sec. 4)."""
-    points = points[np.isfinite(points).all(axis=1)]
+    """Evenly spaced rows of what is in range, as they are, in random order, every one a key point (Ali et al. 2023, Sec. 4)."""
+    points = _crop(points, cfg)
     num = min(len(points), cfg.max_points)
     kept = rng.permutation(np.linspace(0, len(points), num, endpoint=False).astype(np.int64))
     mask = _pad(np.ones(num, bool), cfg.max_points)
@@ -93,7 +93,7 @@ def _raw_scan(points: np.ndarray, cfg: PreprocessConfig, rng: np.random.Generato
 def _crop(points: np.ndarray, cfg: PreprocessConfig) -> np.ndarray:
     with np.errstate(invalid="ignore", over="ignore"):
         squared_range = np.einsum("ij,ij->i", points, points)
-        return points[(squared_range > cfg.min_range_m**2) & (squared_range < cfg.max_range_m**2)]  # NaN compares False
+        return points[(squared_range >= cfg.min_range_m**2) & (squared_range < cfg.max_range_m**2)]  # NaN compares False
 
 
 def _voxel_keys(points: np.ndarray, size: float) -> np.ndarray:

@@ -42,7 +42,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 class Settings:
     """Sizes of the study."""
 
-    size: paper_preset.Settings = paper_preset.Settings(width=64, num_points=256, num_steps=600, num_scenes=200)
+    size: paper_preset.Settings = paper_preset.Settings(width=64, num_points=256, num_steps=600, batch_size=8, num_scenes=200)
     seeds: tuple[int, ...] = (0, 1)
 
 
@@ -110,8 +110,8 @@ def main(argv: list[str] | None = None) -> int:
     num_nonfinite = 0
     with _harness.progress() as bar:
         runs = configs(settings)
-        shared = next(iter(runs.values()))
-        training, held_out = loop.load_worlds(shared, args.out / "worlds", _harness.BarReporter(bar), None)
+        stored = paper_preset.training_config(replace(settings.size, num_points=paper_preset.Settings.num_points))  # with a reserve
+        training, held_out = loop.load_worlds(stored, args.out / "worlds", _harness.BarReporter(bar), None)
         for (name, seed), cfg in runs.items():
             folder = out / f"{name} {seed}".replace(" ", "_").replace(",", "")
             reporter = _harness.BarReporter(bar, f"{name}, seed {seed}", folder / "curve.json")

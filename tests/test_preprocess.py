@@ -1,5 +1,6 @@
 """Raw points to a `Scan`."""
 
+import dataclasses
 from collections import defaultdict
 
 import numpy as np
@@ -231,7 +232,7 @@ def test_one_point_is_kept_of_each_voxel(seed):
     assert not np.array_equal(rows, one_per_voxel(points, 0.7, np.random.default_rng(seed + 1)))
 
 
-RAW = PreprocessConfig(sampling="raw", max_points=100, num_keypoints=100)
+RAW = PreprocessConfig(sampling="raw", min_range_m=0.0, max_range_m=1e5, max_points=100, num_keypoints=100)
 
 
 def numbered(num):
@@ -269,7 +270,7 @@ def test_few_raw_points_are_all_kept(num):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_raw_points_that_are_no_numbers_are_dropped(bad):
-    """Oracle: the same scan without them; points beside the sensor and far away stay, since nothing is cropped."""
+    """Oracle: the same scan without them; points beside the sensor and far away stay, within limits as wide."""
     points = numbered(500)
     points[3] = [0.0, 0.0, 0.0]
     points[4] = [1e4, 0.0, 0.0]
@@ -280,6 +281,15 @@ def test_raw_points_that_are_no_numbers_are_dropped(bad):
     np.testing.assert_array_equal(found.points, clean.points)
     assert {0.0, 1e4} <= set(np.abs(found.points[:90]).max(axis=1).tolist())
     assert_raw(preprocess(np.full((1000, 3), bad), RAW), 0)
+
+
+def test_raw_points_out_of_range_are_dropped():
+    """Oracle: the same scan without them, by their row numbers."""
+    points, cfg = numbered(500), dataclasses.replace(RAW, min_range_m=20.0, max_range_m=300.0)
+    ranges = np.linalg.norm(points.astype(np.float64), axis=1)
+    inside = points[(ranges >= 20.0) & (ranges < 300.0)]
+    assert 0 < len(inside) < 500
+    np.testing.assert_array_equal(preprocess(points, cfg).points, preprocess(inside, RAW).points)
 
 
 def test_same_raw_scan_same_bytes():

@@ -16,7 +16,7 @@ from delo_jax.config import (
 
 _PAPER_MODEL = DeloConfig(
     name="paper",
-    preprocess=PreprocessConfig(sampling="raw", max_points=1024, num_keypoints=1024),
+    preprocess=PreprocessConfig(sampling="raw", min_range_m=0.0, max_range_m=1000.0, max_points=1024, num_keypoints=1024),
     encoder=EncoderConfig(
         kind="dgcnn", num_neighbors=20, edges="relative", edge_scale_m=1.0, position_scale_m=10.0, width=64, embedding_dim=512
     ),
