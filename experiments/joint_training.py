@@ -52,7 +52,7 @@ QUICK = Settings(size=paper_preset.QUICK, seeds=(0,))
 def configs(settings: Settings) -> dict[tuple[str, int], TrainConfig]:
     """Runs by variant and seed."""
     base = replace(paper_preset.training_config(settings.size), validate_every=max(settings.size.num_steps // 6, 10))
-    return {(name, seed): replace(base, seed=seed, **changes) for name, changes in VARIANTS.items() for seed in settings.seeds}
+    return {(name, seed): replace(base, seed=seed, **changes) for seed in settings.seeds for name, changes in VARIANTS.items()}
 
 
 @jax.jit
