@@ -89,7 +89,8 @@ def draw(curves: dict[str, list], file: Path) -> None:
         for name, of_seeds in curves.items():
             steps = list(of_seeds[0])
             values = [np.mean([next(r[field] for r in validations[step] if r["gap"] == 1) for validations in of_seeds]) for step in steps]
-            axes.plot(steps, values, marker="o", label=name)
+            same_at_first = name == "evidence afterwards"  # as odometry alone: drawn so that both are seen
+            axes.plot(steps, values, marker="x" if same_at_first else "o", linestyle=":" if same_at_first else "-", label=name)
         axes.set(xlabel="steps", ylabel=f"median error at gap 1 [{unit}]", ylim=(0, None))
         axes.legend(fontsize=7)
     figure.savefig(file, dpi=120)
