@@ -10,13 +10,16 @@ from numpy.typing import ArrayLike
 
 from delo_jax.errors import ScanError
 from delo_jax.geometry import se3
+from delo_jax.geometry.point_to_plane import robust_point_to_plane
 from delo_jax.model import delo
-from delo_jax.preprocess import check_points, preprocess
+from delo_jax.preprocess import Scan, check_points, preprocess
 from delo_jax.uncertainty import covariance, status
 from delo_jax.uncertainty.observability import observability
 
 encode = jax.jit(delo.encode)
 solve = jax.jit(delo.solve)
+fine_step = jax.jit(delo.fine_step)
+robust_steps = jax.jit(robust_point_to_plane, static_argnames=("scale_m", "reach_m", "num_steps"))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,6 +75,7 @@ class EncodedScan(NamedTuple):
 
     encoding: delo.Encoding
     num_points: int  # usable points
+    scan: Scan  # what was encoded; NumPy arrays
 
 
 def prepare(params: delo.Model, points: ArrayLike) -> EncodedScan:
@@ -81,7 +85,7 @@ def prepare(params: delo.Model, points: ArrayLike) -> EncodedScan:
         ScanError: not an array of numbers of shape (n, 3).
     """
     scan = preprocess(check_points(points), params.cfg.preprocess)
-    return EncodedScan(encode(params, scan), int(scan.mask.sum()))
+    return EncodedScan(encode(params, scan), int(scan.mask.sum()), scan)
 
 
 def align(params: delo.Model, source: EncodedScan, target: EncodedScan, T_target_source_init: np.ndarray) -> Estimate:

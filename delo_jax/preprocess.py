@@ -96,7 +96,8 @@ def _crop(points: np.ndarray, cfg: PreprocessConfig) -> np.ndarray:
         return points[(squared_range >= cfg.min_range_m**2) & (squared_range < cfg.max_range_m**2)]  # NaN compares False
 
 
-def _voxel_keys(points: np.ndarray, size: float) -> np.ndarray:
+def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:
+    """One int64 per point, the same for all points of a voxel [m]; unique within 2^20 voxels of the origin."""
     cells = np.floor(points * np.float32(1.0 / size)).astype(np.int64) + (1 << 20)
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 
@@ -105,7 +106,7 @@ def voxel_mean(points: np.ndarray, size: float) -> np.ndarray:
     """Mean of the points of every occupied voxel, (v, 3) float32."""
     if len(points) == 0:
         return points
-    keys = _voxel_keys(points, size)
+    keys = voxel_keys(points, size)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
@@ -116,7 +117,7 @@ def voxel_mean(points: np.ndarray, size: float) -> np.ndarray:
 def one_per_voxel(points: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
     """Row of one random point per occupied voxel, in random order."""
     order = rng.permutation(len(points))
-    _, first = np.unique(_voxel_keys(points[order], size), return_index=True)
+    _, first = np.unique(voxel_keys(points[order], size), return_index=True)
     return order[np.sort(first)]
 
 
@@ -144,19 +145,29 @@ def _describe(cloud: np.ndarray, rows: np.ndarray, cfg: PreprocessConfig):
 
 
 def _features(points, normals, eigenvalues, ranges, fill, mean_distance) -> np.ndarray:
-    """Eight numbers of order one that do not change when the sensor yaws."""
+    """Eight numbers of order one that do not change when the sensor yaws: five of the surface, three of where it is seen from."""
     small, middle, large = np.maximum(eigenvalues, 1e-8).T
-    columns = [
+    surface = [
         np.sqrt(small / large),
         np.sqrt(middle / large),
         np.log10(small) / 2 + 1.5,  # thickness; 3 cm is 0
         fill,
         np.log(np.maximum(mean_distance, 1e-3)) + 1.0,
-        np.log(ranges) - 2.7,
-        points[:, 2] / 3.0,
-        np.abs(normals[:, 2]),
     ]
-    return np.stack(columns, axis=1).astype(np.float32)
+    return posed_features(np.stack(surface, axis=1), ranges, points, normals)
+
+
+def posed_features(features: np.ndarray, ranges: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Features of points as a sensor at the origin sees them: the first five of `features`, then range, height, steepness.
+
+    Args:
+        features: (n, 5 or more), of which the first five belong to the surface.
+        ranges: (n,) distances at which they are seen [m].
+        points: (n, 3) in the sensor frame [m].
+        normals: (n, 3) unit.
+    """
+    seen = [np.log(ranges) - 2.7, points[:, 2] / 3.0, np.abs(normals[:, 2])]
+    return np.concatenate([features[:, :5], np.stack(seen, axis=1)], axis=1).astype(np.float32)
 
 
 def _select(normals: np.ndarray, valid: np.ndarray, cfg: PreprocessConfig, rng: np.random.Generator) -> np.ndarray:

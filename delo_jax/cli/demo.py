@@ -49,6 +49,7 @@ class Demo(Command):
             source=source,
             folder=self.out,
             weights=self.weights,
+            use_map=False,
             deskew=True,
             stage="simulate",
             facts={

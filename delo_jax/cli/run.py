@@ -35,6 +35,8 @@ class Run(Command):
     """Folder for the results; runs/NAME, numbered, by default."""
     weights: str = "delo-base"
     """Released weights by name, or a .safetensors file."""
+    map: Literal["none", "local"] = "none"
+    """none: each scan is aligned with the last one; local: with a map of what was seen lately."""
     deskew: Literal["auto", "on", "off"] = "auto"
     """Undo the motion within a sweep. auto: where points carry times; on: also by azimuth, for scans as measured."""
     no_elevation_correction: bool = False
@@ -56,6 +58,7 @@ class Run(Command):
             source=dataset,
             folder=folder,
             weights=self.weights,
+            use_map=self.map == "local",
             deskew=self.deskew != "off",
             stage="read",
             facts=self._facts(dataset, deskew),
@@ -71,6 +74,7 @@ class Run(Command):
                 "point_times": dataset.point_times,
                 "deskew": deskew,
             },
+            "map": self.map,
             "truth": dataset.truth_source,
         }
 

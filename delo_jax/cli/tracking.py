@@ -68,6 +68,7 @@ class Job:
     source: Scans
     folder: Path
     weights: str
+    use_map: bool
     deskew: bool
     stage: str
     """What getting a scan is called in the timing."""
@@ -133,7 +134,7 @@ def track(job: Job) -> Result:
         writer = RunWriter(job.folder, T_cam_lidar=job.source.T_cam_lidar, timing_names=(job.stage, *STAGES))
     except OSError as error:
         raise ConfigError(f"--out {job.folder}: expected a folder to write to, got {error.strerror}; choose another") from error
-    odometry = LidarOdometry(params, deskew=job.deskew)
+    odometry = LidarOdometry(params, use_map=job.use_map, deskew=job.deskew)
     with writer:
         acquired, interrupted = _loop(job, odometry, writer)
     result = _result(job, odometry.trajectory(), acquired, compile_s, interrupted)

@@ -1,10 +1,10 @@
-"""One damped Gauss-Newton step of point-to-plane registration."""
+"""Point-to-plane registration: one damped Gauss-Newton step, and a few robust ones towards given matches."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from delo_jax.geometry import se3
 from delo_jax.geometry.se3 import full_float32
@@ -84,3 +84,68 @@ def point_to_plane_step(
     shift = (centre - centre @ T_centred[:3, :3].T)[0]  # from the twist about the mean to the one about the origin
     to_scaled = eye.at[:3, :3].mul(radius).at[3:, :3].set(-se3.skew(centre[0]))
     return PlaneStep(T_centred.at[:3, 3].add(shift), total * (to_scaled.T @ hessian @ to_scaled))
+
+
+class RobustFit(NamedTuple):
+    """Where a few robust steps ended."""
+
+    T_target_source: Float[Array, "4 4"]
+    score: Float[Array, ""]
+    """Mean robust weight of all source points, in [0, 1]: a point without a match within reach counts as 0."""
+    rms_m: Float[Array, ""]
+    """Weighted root mean square distance to the planes [m]."""
+    information: Float[Array, "6 6"]
+    """Of the planes, for a right perturbation of T_target_source, order [omega, v], per unit of weight."""
+
+
+@full_float32
+def robust_point_to_plane(
+    points: Float[Array, "n 3"],
+    normals: Float[Array, "n 3"],
+    mask: Bool[Array, " n"],
+    targets: Float[Array, "n 3"],
+    target_normals: Float[Array, "n 3"],
+    T_init: Float[Array, "4 4"],
+    *,
+    scale_m: float,
+    reach_m: float,
+    num_steps: int,
+) -> RobustFit:
+    """Iteratively reweighted point-to-plane steps (Geman and McClure 1987) towards given matches.
+
+    A match counts by (scale^2 / (scale^2 + distance^2))^2, where distance is that to the target's plane; one beyond reach, or whose
+    normals are more than 45 degrees apart, not at all.
+
+    Args:
+        points: source points [m].
+        normals: theirs, unit.
+        mask: True where a source point is real.
+        targets: target of each source point [m].
+        target_normals: theirs, unit.
+        T_init: T_target_source to start from.
+        scale_m: distance at which a match counts a quarter [m].
+        reach_m: a match farther apart than this is none [m].
+        num_steps: static.
+    """
+    no_tangential = jnp.zeros(points.shape[0], points.dtype)
+
+    def weigh(T):
+        moved, turned = se3.transform(T, points), normals @ T[:3, :3].T
+        offset = moved - targets
+        distance2 = jnp.sum(offset * target_normals, axis=1) ** 2
+        near = jnp.sum(offset * offset, axis=1) < reach_m**2
+        agrees = jnp.sum(turned * target_normals, axis=1) > 0.5**0.5
+        weights = jnp.where(mask & near & agrees, (scale_m**2 / (scale_m**2 + distance2)) ** 2, 0.0)
+        return moved, weights, distance2
+
+    def iterate(T, _):
+        moved, weights, _ = weigh(T)
+        return point_to_plane_step(moved, targets, target_normals, weights, no_tangential, damping=0.0).T_delta @ T, None
+
+    T, _ = jax.lax.scan(iterate, T_init, length=num_steps)
+    moved, weights, distance2 = weigh(T)
+    total = jnp.sum(weights) + 1e-9
+    information = point_to_plane_step(moved, targets, target_normals, weights, no_tangential, damping=0.0).information
+    Ad = se3.adjoint(T)
+    rms = jnp.sqrt(jnp.sum(weights * distance2) / total)
+    return RobustFit(T, total / jnp.maximum(jnp.sum(mask.astype(points.dtype)), 1.0), rms, Ad.T @ information @ Ad / total)

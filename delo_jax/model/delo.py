@@ -167,6 +167,23 @@ def refine_pose(model: Applicable, source: fine.Cloud, target: fine.Cloud, T_ini
 
 
 @full_float32
+def fine_step(model: Applicable, source: fine.Cloud, points, normals, features, T_init: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
+    """One iteration of the fine stage towards given matches, for a caller that finds neighbours itself.
+
+    Args:
+        model: weights and config.
+        source: n points of the source scan.
+        points: (n, 3) target of each [m].
+        normals: (n, 3) of the targets.
+        features: (n, f) of the targets, seen from where the target frame is.
+        T_init: T_target_source before the step.
+    """
+    matched = fine.Cloud(points, normals, model.apply("embed", features), source.mask)
+    T_delta, _ = fine.step(fine.weigh(model.confidence, source, matched, T_init), cfg=model.cfg.fine)
+    return T_delta @ T_init
+
+
+@full_float32
 def solve(model: Applicable, source: Encoding, target: Encoding, T_init: Float[Array, "4 4"]) -> Registration:
     """Pose of a pair, its information and evidence.
 

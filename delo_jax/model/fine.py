@@ -107,14 +107,20 @@ Confidence = Callable[[Array, Array, Array], Array]  # embeddings of source and 
 def match(confidence: Confidence, source: Cloud, target: Cloud, T_target_source: Float[Array, "4 4"]) -> Matches:
     """Nearest target of every source point at a pose, with the learned confidence of each match."""
     points = se3.transform(T_target_source, source.points)
-    normals = source.normals @ T_target_source[:3, :3].T
     index, _ = nearest(jax.lax.stop_gradient(points), target.points, target.mask)
-    targets, target_normals = target.points[index], target.normals[index]
-    geometry, plane_distance, agreement = match_geometry(points, normals, targets, target_normals, source.mask)
-    logits = confidence(source.embedding, target.embedding[index], geometry)
+    return weigh(confidence, source, jax.tree.map(lambda array: array[index], target), T_target_source)
+
+
+@full_float32
+def weigh(confidence: Confidence, source: Cloud, matched: Cloud, T_target_source: Float[Array, "4 4"]) -> Matches:
+    """Learned confidence of given matches at a pose: row i of `matched` is the target of source point i."""
+    points = se3.transform(T_target_source, source.points)
+    normals = source.normals @ T_target_source[:3, :3].T
+    geometry, plane_distance, agreement = match_geometry(points, normals, matched.points, matched.normals, source.mask)
+    logits = confidence(source.embedding, matched.embedding, geometry)
     weights = jnp.where(source.mask, nn.sigmoid(logits[:, 0]), 0.0)
     tangential = MAX_TANGENTIAL * weights * nn.sigmoid(logits[:, 1])
-    return Matches(points, targets, target_normals, plane_distance, agreement, weights, tangential)
+    return Matches(points, matched.points, matched.normals, plane_distance, agreement, weights, tangential)
 
 
 def step(matches: Matches, *, cfg: FineConfig) -> tuple[Float[Array, "4 4"], Float[Array, "6 6"]]:

@@ -14,6 +14,7 @@ from delo_jax.geometry import se3
 from delo_jax.inference import EncodedScan, Estimate
 from delo_jax.model.delo import Model
 from delo_jax.pipeline.motion_model import NANOSECOND, ConstantVelocity
+from delo_jax.pipeline.scan_to_map import MapTracker
 from delo_jax.pipeline.trajectory import Trajectory
 from delo_jax.preprocess import check_points
 from delo_jax.uncertainty import covariance
@@ -62,7 +63,10 @@ class Anchor(NamedTuple):
 
 
 class LidarOdometry:
-    """Scan-to-scan LiDAR odometry. Not thread-safe; one instance per sensor stream.
+    """LiDAR odometry on a local map, or from scan to scan. Not thread-safe; one instance per sensor stream.
+
+    On the map, the motion model predicts and the scan is registered from there. Where that fails, at the first pair and after an
+    outage, the network aligns the scan with the last good one, with no prior, and the map judges its proposal.
 
     A bad scan never stops a drive: its pose is the motion model's, its status `rejected`, its covariance honest about it.
     The last good scan stays the source, so that the next pair bridges the gap; when it has gone out of reach, two
@@ -70,6 +74,7 @@ class LidarOdometry:
 
     Args:
         params: weights, from `delo_jax.load`.
+        use_map: register to a local map of what was seen lately, rather than to the last scan.
         deskew: undo the motion within a sweep where points carry times.
         prepare: raw points to an encoded scan; `inference.prepare` by default.
         align: two encoded scans and a start to an estimate; `inference.align` by default.
@@ -79,12 +84,14 @@ class LidarOdometry:
         self,
         params: Model,
         *,
+        use_map: bool = False,
         deskew: bool = True,
         prepare: Callable[[Model, np.ndarray], EncodedScan] = inference.prepare,
         align: Callable[[Model, EncodedScan, EncodedScan, np.ndarray], Estimate] = inference.align,
     ):
         self._params, self._deskew, self._prepare, self._align = params, deskew, prepare, align
         self._motion_model = ConstantVelocity()
+        self._map = MapTracker(params) if use_map else None
         self._anchor: Anchor | None = None  # the last good scan
         self._doubtful: Anchor | None = None  # the newest usable scan that did not fit it
         self._num_frames, self._last_stamp_ns, self._num_rejected = 0, 0, 0
@@ -112,7 +119,7 @@ class LidarOdometry:
             skewed = Sweep(points.copy(), sweep.times_s.copy())
         target = Source(scan, skewed, stamp_ns, self._num_frames)
         prepared = time.perf_counter()
-        motion, target = self._locate(target)
+        motion, target = self._locate(target) if self._map is None else self._locate_on_map(target, self._map)
         timing = {"prepare": prepared - begin, "solve": time.perf_counter() - prepared}
         return self._finish(target, motion, stamp_ns, timing)
 
@@ -160,6 +167,28 @@ class LidarOdometry:
                 return second, aligned_second
         return motion, aligned
 
+    def _locate_on_map(self, target: Source, tracker: MapTracker) -> tuple[Estimate, Source]:
+        """Motion to a new scan by the map, from the motion model's prediction; where that is bad, from the network's proposal."""
+        anchor, motion = self._anchor, None
+        if anchor is None:
+            return self._first(target), target
+        if self._motion_model.velocity is not None:
+            guess = self._motion_model.predict((target.stamp_ns - anchor.source.stamp_ns) * NANOSECOND)
+            motion = tracker.locate(target.scan, anchor.T_world_lidar, guess)
+            if motion.status in ("ok", "degenerate"):
+                return motion, target
+        pair, aligned = self._locate(target)
+        if pair.status == "rejected":
+            return motion or pair, target
+        since = self._anchor or anchor
+        if since is not anchor:  # a doubtful scan took over: where it is on the old map, nobody knows
+            tracker.restart(since.source.scan, since.T_world_lidar)
+            motion = None
+        proposed = tracker.locate(aligned.scan, since.T_world_lidar, pair.T_target_source, recovering=True)
+        if motion is not None and motion.confidence >= proposed.confidence:
+            return motion, target
+        return proposed, aligned
+
     def _first(self, target: Source) -> Estimate:
         """The first scan is the world, unless it is unusable."""
         minimum = self._params.cfg.status.min_points
@@ -204,6 +233,8 @@ class LidarOdometry:
             if anchor is not None:
                 self._motion_model.update(motion.T_target_source, (stamp_ns - anchor.source.stamp_ns) * NANOSECOND)
             self._anchor, self._doubtful, self._num_rejected = Anchor(target, T_world_lidar, covariance_world), None, 0
+            if self._map is not None:
+                self._map.insert(target.scan, T_world_lidar)
         elif target is not None and anchor is not None and target.scan.num_points >= self._params.cfg.status.min_points:
             self._doubtful = Anchor(target, T_world_lidar, covariance_world)
         self._num_frames, self._last_stamp_ns = number + 1, stamp_ns

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from delo_jax.config import StatusConfig
+from delo_jax.config import LEVER_M, StatusConfig
 from delo_jax.geometry import se3
 from delo_jax.uncertainty.observability import Observability
 
@@ -57,6 +57,22 @@ def from_pose6_evidence(T: np.ndarray, gamma: np.ndarray, nu: np.ndarray, alpha:
     half = J * np.sqrt(aleatoric + epistemic)
     covariance = half @ half.T + np.outer(moved, moved)  # symmetric to the last bit
     return Uncertainty(J**2 @ aleatoric, J**2 @ epistemic, covariance)
+
+
+def from_information(information: np.ndarray, *, sigma_m: float, num_planes: float) -> Uncertainty:
+    """Inverse of a registration's Gauss-Newton matrix, not calibrated; all of it counts as noise of the data.
+
+    Args:
+        information: (6, 6) of the planes, for a right perturbation of the pose, per unit of weight.
+        sigma_m: standard deviation of a plane distance.
+        num_planes: how many independent planes the weights amount to.
+    """
+    precision = num_planes / sigma_m**2 * 0.5 * (information + information.T)
+    scale = np.repeat([1.0 / LEVER_M, 1.0], 3)
+    values, vectors = np.linalg.eigh(scale[:, None] * precision * scale[None, :])
+    half = scale[:, None] * vectors / np.sqrt(np.maximum(values, 1e-2))  # at least 10 m where nothing holds
+    covariance = half @ half.T
+    return Uncertainty(np.diag(covariance).copy(), np.zeros(6), covariance)
 
 
 def unknown(cfg: StatusConfig) -> Uncertainty:

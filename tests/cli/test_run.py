@@ -83,6 +83,17 @@ def test_what_the_run_says_of_itself(folder, tree, weights_file):
     assert options["model"]["preprocess"]["max_points"] == 3072
 
 
+def test_run_on_a_map(tree, cli, tmp_path):
+    """Oracle: the option given, and the simulator's poses; released weights."""
+    code, printed, _ = cli("run", str(tree), "--map", "local", "--weights", "delo-base", "--out", str(tmp_path / "out"))
+    assert code == 0, printed
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["map"] == "local"
+    assert check_whole(tmp_path / "out") == NUM_SCANS
+    true = read_rows(tree / "poses" / f"{NAME}.txt")
+    found = read_rows(tmp_path / "out" / "poses_kitti.txt")
+    assert np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1).max() < 0.05
+
+
 def test_same_bytes_twice_in_numbered_folders(folder, tree, cli, monkeypatch, tmp_path):
     """Oracle: the bytes of the run before."""
     monkeypatch.chdir(tmp_path)

@@ -1,0 +1,119 @@
+"""The local map: surfaces seen lately, one per voxel, around the sensor. Host code."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from delo_jax.config import NUM_FEATURES
+from delo_jax.geometry import se3
+from delo_jax.preprocess import posed_features, voxel_keys
+
+SAME_SURFACE = 0.5  # cosine between normals above which two observations are of one surface
+MUCH_NEARER = 0.5  # of the range at which a voxel was seen: a nearer observation replaces it
+
+
+class Surfaces(NamedTuple):
+    """Points with normals and features, as the network sees them from one pose."""
+
+    points: np.ndarray  # (n, 3) float32 [m]
+    normals: np.ndarray  # (n, 3) float32, unit, towards the sensor
+    features: np.ndarray  # (n, f) float32
+
+
+class _Voxels(NamedTuple):
+    """Occupied voxels, ascending by key."""
+
+    keys: np.ndarray  # (v,) int64
+    points: np.ndarray  # (v, 3) mean, world frame; float64, for far from its origin too
+    normals: np.ndarray  # (v, 3) float32
+    features: np.ndarray  # (v, f) float32
+    ranges: np.ndarray  # (v,) float32, smallest distance from which it was seen [m]
+    counts: np.ndarray  # (v,) float32, observations in the mean
+
+    def rows(self, which: np.ndarray) -> "_Voxels":
+        """Those voxels."""
+        return _Voxels(*(array[which] for array in self))
+
+    def merged(self, other: "_Voxels") -> "_Voxels":
+        """These and others, which have other keys."""
+        both = _Voxels(*(np.concatenate(arrays) for arrays in zip(self, other, strict=True)))
+        return both.rows(np.argsort(both.keys, kind="stable"))
+
+
+class LocalMap:
+    """Running means of points, normals and features in voxels of the world, as far as the sensor reaches.
+
+    Memory is bounded by the reach: what lies beyond it is forgotten by `prune`. A voxel holds one surface: observations whose
+    normals agree with it are averaged; others are ignored, unless they were made from much nearer and take its place.
+
+    Args:
+        voxel_m: size of a voxel.
+        reach_m: distance from the newest pose beyond which a voxel is forgotten.
+        max_count: largest weight of a voxel's past; from then on its mean follows what is seen.
+    """
+
+    def __init__(self, voxel_m: float = 1.0, reach_m: float = 100.0, max_count: int = 10):
+        self._voxel_m, self._reach_m, self._max_count = voxel_m, reach_m, max_count
+        self._voxels: _Voxels | None = None
+
+    def __len__(self) -> int:
+        """Number of voxels."""
+        return 0 if self._voxels is None else len(self._voxels.keys)
+
+    def insert(self, seen: Surfaces, T_world_lidar: np.ndarray) -> None:
+        """Take in what one scan shows, each voxel once: of several points in one, the nearest to the sensor."""
+        new = self._observed(seen, T_world_lidar)
+        if self._voxels is None or len(self) == 0:
+            self._voxels = new
+            return
+        at = np.minimum(np.searchsorted(self._voxels.keys, new.keys), len(self) - 1)
+        known = self._voxels.keys[at] == new.keys
+        self._average(self._voxels, at[known], new.rows(known))
+        self._voxels = self._voxels.merged(new.rows(~known))
+
+    def _observed(self, seen: Surfaces, T_world_lidar: np.ndarray) -> _Voxels:
+        """A scan as voxels seen once."""
+        world = se3.transform(T_world_lidar, seen.points.astype(np.float64))
+        normals = (seen.normals @ T_world_lidar[:3, :3].T).astype(np.float32)
+        ranges = np.linalg.norm(seen.points, axis=1).astype(np.float32)
+        keys = voxel_keys(world, self._voxel_m)
+        order = np.lexsort((ranges, keys))
+        first = order[np.flatnonzero(np.r_[True, keys[order][1:] != keys[order][:-1]])] if len(order) else order
+        return _Voxels(keys, world, normals, seen.features, ranges, np.ones(len(keys), np.float32)).rows(first)
+
+    def _average(self, held: _Voxels, rows: np.ndarray, new: _Voxels) -> None:
+        """Observations of voxels that are there already."""
+        old = held.rows(rows)
+        agrees = np.einsum("ij,ij->i", old.normals, new.normals) > SAME_SURFACE
+        replaces = ~agrees & (new.ranges < MUCH_NEARER * old.ranges)
+        counts = np.where(agrees, np.minimum(old.counts + 1.0, self._max_count), np.where(replaces, 1.0, old.counts))
+        weight = np.where(agrees | replaces, np.where(agrees, 1.0 / counts, 1.0), 0.0)[:, None].astype(np.float32)
+        normals = old.normals + weight * (new.normals - old.normals)
+        held.points[rows] = old.points + weight * (new.points - old.points)
+        held.normals[rows] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        held.features[rows] = old.features + weight * (new.features - old.features)
+        held.ranges[rows] = np.where(agrees | replaces, np.minimum(old.ranges, new.ranges), old.ranges)
+        held.counts[rows] = counts
+
+    def prune(self, T_world_lidar: np.ndarray) -> None:
+        """Forget what is out of reach of a pose."""
+        if self._voxels is not None:
+            self._voxels = self._voxels.rows(_near(self._voxels, T_world_lidar, self._reach_m))
+
+    def crop(self, T_world_lidar: np.ndarray, reach_m: float) -> Surfaces:
+        """The map within reach of a pose, in the sensor frame there, with the features that a sensor there would see."""
+        if self._voxels is None:
+            nothing = np.zeros((0, 3), np.float32)
+            return Surfaces(nothing, nothing, np.zeros((0, NUM_FEATURES), np.float32))
+        near = self._voxels.rows(_near(self._voxels, T_world_lidar, reach_m))
+        R = T_world_lidar[:3, :3]
+        points = ((near.points - T_world_lidar[:3, 3]) @ R).astype(np.float32)
+        normals = (near.normals @ R).astype(np.float32)
+        normals = np.where(np.einsum("ij,ij->i", normals, points)[:, None] > 0, -normals, normals)
+        ranges = np.maximum(np.linalg.norm(points, axis=1), 1e-3)
+        return Surfaces(points, normals, posed_features(near.features, ranges, points, normals))
+
+
+def _near(voxels: _Voxels, T_world_lidar: np.ndarray, reach_m: float) -> np.ndarray:
+    offset = voxels.points - T_world_lidar[:3, 3]
+    return np.einsum("ij,ij->i", offset, offset) < reach_m**2
