@@ -47,7 +47,7 @@ def measure(params, scans: list[np.ndarray], num_scans: int) -> dict[str, list[f
     for k in track(range(WARM_UP + num_scans), "scans", console=Console(stderr=True)):
         scan, preprocess_ms = timed(preprocess, scans[(k + 1) % len(scans)], params.cfg.preprocess)
         encoding, encode_ms = timed(inference.encode, params, scan)
-        target = inference.EncodedScan(encoding, int(scan.mask.sum()))
+        target = inference.EncodedScan(encoding, int(scan.mask.sum()), scan)
         _, align_ms = timed(inference.align, params, source, target, np.eye(4))
         source = target
         if k >= WARM_UP:

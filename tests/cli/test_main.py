@@ -50,7 +50,8 @@ def test_choices_are_those_of_the_simulator():
 def test_options_in_toml(cli):
     """Oracle: the standard library's TOML parser; a path may hold quotes, backslashes and line breaks."""
     done = cli("run", 'a "b"\\c\nd', "--deskew", "off", "--dump-config", "--weights", "w")
-    assert tomllib.loads(done.out) == {"path": 'a "b"\\c\nd', "weights": "w", "deskew": "off", "no_elevation_correction": False}
+    expected = {"path": 'a "b"\\c\nd', "weights": "w", "map": "none", "deskew": "off", "no_elevation_correction": False}
+    assert tomllib.loads(done.out) == expected
 
 
 def test_training_options_can_be_trained_with(cli, tmp_path):

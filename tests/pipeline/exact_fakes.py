@@ -52,7 +52,7 @@ class ExactNetwork:
     def prepare(self, params, points):
         points = points.copy() if self._copy else points
         self.prepared.append(points)
-        return EncodedScan(points, len(points))
+        return EncodedScan(points, len(points), points)
 
     def _fits(self, T, source, target):
         apart = np.abs(source @ T[:3, :3].T + T[:3, 3] - target).max()

@@ -212,7 +212,7 @@ def test_scans_do_not_pile_up():
     """Oracle: weak references; of all scans given only the last stays alive in the odometry."""
     odometry = LidarOdometry(
         PARAMS,
-        prepare=lambda params, points: EncodedScan(points, len(points)),
+        prepare=lambda params, points: EncodedScan(points, len(points), points),
         align=lambda *arguments: ExactNetwork().align(*arguments),
     )
     alive = []
