@@ -27,7 +27,7 @@ def observed(seed, num=400):
 
 def insert(voxels, seen, T):
     """The specification: the nearest of a scan's points in a voxel; mean where normals agree, replaced from much nearer."""
-    nearest = {}
+    nearest: dict[tuple, tuple] = {}
     for point, normal, features in zip(*(array.astype(np.float64) for array in seen), strict=True):
         world = T[:3, :3] @ point + T[:3, 3]
         key, distance = tuple(np.floor(world).astype(int)), np.linalg.norm(point)
@@ -50,7 +50,8 @@ def insert(voxels, seen, T):
 
 def test_voxels_hold_running_means():
     """Oracle: the dictionary; ten scans, seen from one pose in the end. The order of the voxels is free."""
-    local_map, voxels = LocalMap(max_count=MAX_COUNT), {}
+    local_map = LocalMap(max_count=MAX_COUNT)
+    voxels: dict[tuple, list] = {}
     for seed in range(10):
         seen, T = observed(seed)
         local_map.insert(seen, T)
