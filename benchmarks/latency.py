@@ -20,7 +20,6 @@ from rich.progress import track
 
 import delo_jax
 from delo_jax import inference
-from delo_jax.preprocess import preprocess
 from delo_jax.sim import simulate_drive
 
 WARM_UP, NUM_SCANS = 20, 200
@@ -44,10 +43,10 @@ def measure(params, scans: list[np.ndarray], num_scans: int) -> dict[str, list[f
     """Milliseconds per stage and scan; the older scan of each pair is encoded already, as in a stream."""
     times: dict[str, list[float]] = {"preprocess": [], "encode": [], "align": [], "total": []}
     source = inference.prepare(params, scans[0])
+    jax.block_until_ready(source.encoding)
     for k in track(range(WARM_UP + num_scans), "scans", console=Console(stderr=True)):
-        scan, preprocess_ms = timed(preprocess, scans[(k + 1) % len(scans)], params.cfg.preprocess)
-        encoding, encode_ms = timed(inference.encode, params, scan)
-        target = inference.EncodedScan(encoding, int(scan.mask.sum()), scan)
+        target, preprocess_ms = timed(inference.prepare, params, scans[(k + 1) % len(scans)])
+        _, encode_ms = timed(lambda scan: scan.encoding, target)
         _, align_ms = timed(inference.align, params, source, target, np.eye(4))
         source = target
         if k >= WARM_UP:

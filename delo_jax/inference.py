@@ -1,7 +1,7 @@
 """`odometry(params, src, tgt)`: two scans in, a pose with covariance and status out. Holds the jitted encode and solve."""
 
 import dataclasses
-from typing import NamedTuple
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from delo_jax.errors import ScanError
 from delo_jax.geometry import se3
-from delo_jax.geometry.point_to_plane import robust_point_to_plane
+from delo_jax.geometry.point_to_plane import robust_point_to_plane, robust_sweep_to_plane
 from delo_jax.model import delo
-from delo_jax.preprocess import Scan, check_points, preprocess
+from delo_jax.preprocess import Scan, check_points, preprocess_timed, still
 from delo_jax.uncertainty import covariance, status
 from delo_jax.uncertainty.observability import observability
 
@@ -20,6 +20,7 @@ encode = jax.jit(delo.encode)
 solve = jax.jit(delo.solve)
 fine_step = jax.jit(delo.fine_step)
 robust_steps = jax.jit(robust_point_to_plane, static_argnames=("scale_m", "reach_m", "num_steps"))
+sweep_steps = jax.jit(robust_sweep_to_plane, static_argnames=("scale_m", "reach_m", "num_steps", "sigma_velocity", "sigma_m"))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,26 +71,52 @@ class Estimate:
         )
 
 
-class EncodedScan(NamedTuple):
-    """A scan after preprocessing and the network's encoder; kept, so that no scan is encoded twice."""
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class PreparedScan:
+    """A preprocessed scan; encoded when the network first asks for it, and never twice."""
 
-    encoding: delo.Encoding
-    num_points: int  # usable points
-    scan: Scan  # what was encoded; NumPy arrays
+    params: delo.Model
+    scan: Scan
+    """NumPy arrays; de-skewed if it came from `still`."""
+    measured: Scan
+    """The same as measured by the moving sensor."""
+    times_s: np.ndarray | None
+    """(m,) of its points, relative to the stamp; None where the points carry none."""
+
+    @functools.cached_property
+    def num_points(self) -> int:
+        """Usable points."""
+        return int(self.scan.mask.sum())
+
+    @functools.cached_property
+    def encoding(self) -> delo.Encoding:
+        """What the network keeps of it."""
+        return encode(self.params, self.scan)
+
+    def still(self, velocity: np.ndarray | None) -> "PreparedScan":
+        """The scan de-skewed with a body velocity (6,) [omega rad/s, v m/s]; as measured where that or the times are not known."""
+        if self.times_s is None or velocity is None:
+            return self
+        return dataclasses.replace(self, scan=still(self.measured, self.times_s, velocity))
 
 
-def prepare(params: delo.Model, points: ArrayLike) -> EncodedScan:
-    """Preprocess and encode a scan.
+def prepare(params: delo.Model, points: ArrayLike, times_s: np.ndarray | None = None) -> PreparedScan:
+    """Preprocess a scan; the network encodes it when it first needs to.
+
+    Args:
+        params: weights.
+        points: (n, 3) in the sensor frame, as measured [m].
+        times_s: (n,) relative to the stamp, to de-skew the scan by later; None when there is nothing to de-skew.
 
     Raises:
         ScanError: not an array of numbers of shape (n, 3).
     """
-    scan = preprocess(check_points(points), params.cfg.preprocess)
-    return EncodedScan(encode(params, scan), int(scan.mask.sum()), scan)
+    scan, times_s = preprocess_timed(check_points(points), times_s, params.cfg.preprocess)
+    return PreparedScan(params=params, scan=scan, measured=scan, times_s=times_s)
 
 
-def align(params: delo.Model, source: EncodedScan, target: EncodedScan, T_target_source_init: np.ndarray) -> Estimate:
-    """Estimate of a pair of encoded scans from a start; see `odometry`."""
+def align(params: delo.Model, source: PreparedScan, target: PreparedScan, T_target_source_init: np.ndarray) -> Estimate:
+    """Estimate of a pair of scans from a start; see `odometry`."""
     limits = params.cfg.status
     start = np.asarray(T_target_source_init, np.float64)
     result = jax.device_get(solve(params, source.encoding, target.encoding, jnp.asarray(start, jnp.float32)))

@@ -9,9 +9,11 @@ from scipy.spatial import cKDTree
 
 from delo_jax.config import NUM_FEATURES, PreprocessConfig
 from delo_jax.errors import ScanError
+from delo_jax.geometry.deskew import sweep_poses
 from delo_jax.geometry.normals import plane_fit
 
 MIN_NEIGHBORS = 5  # a plane through fewer points says nothing
+MAX_RADIUS_M = 1.5  # of a neighbourhood
 HORIZONTAL = 0.85  # |n_z| above which a surface counts as ground-like
 
 
@@ -61,16 +63,35 @@ def preprocess(points: np.ndarray, cfg: PreprocessConfig) -> Scan:
     Raises:
         ScanError: wrong shape or dtype.
     """
+    return preprocess_timed(points, None, cfg)[0]
+
+
+def preprocess_timed(points: np.ndarray, times_s: np.ndarray | None, cfg: PreprocessConfig) -> tuple[Scan, np.ndarray | None]:
+    """Scan of a sensor sweep, and when each of its points was measured.
+
+    Args:
+        points: (n, 3) in the sensor frame [m]; rows that are not finite or out of range are dropped.
+        times_s: (n,) relative to the stamp; one that is not finite counts as 0. None where there are none.
+        cfg: sizes and thresholds.
+
+    Returns:
+        The scan, as measured, and (max_points,) float32 times [s], means over a voxel like the points; None without times.
+
+    Raises:
+        ScanError: wrong shape or dtype.
+    """
     points, rng = check_points(points), np.random.default_rng(0)  # the same scan gives the same bytes
+    columns = points if times_s is None else np.column_stack([points, np.nan_to_num(times_s, nan=0.0, posinf=0.0, neginf=0.0)])
     if cfg.sampling == "raw":
-        return _raw_scan(points, cfg, rng)
-    cloud = voxel_mean(_crop(points, cfg), cfg.voxel_m)
-    rows = one_per_voxel(cloud, cfg.point_voxel_m, rng) if len(cloud) else np.zeros(0, np.int64)
-    centers, normals, features, valid = _describe(cloud, rows, cfg)
+        return _raw_scan(_crop(columns.astype(np.float32, copy=False), cfg), cfg, rng)
+    stride = max(1, -(-len(columns) // cfg.max_raw_points))
+    cloud = voxel_mean(_crop(columns[::stride].astype(np.float32, copy=False), cfg), cfg.voxel_m)
+    rows = one_per_voxel(cloud, cfg.point_voxel_m, rng)[: 2 * cfg.max_points]
+    centers, normals, features, valid = _describe(cloud[:, :3], rows, cfg)
     kept = _select(normals, valid, cfg, rng)
     points, normals, features = centers[kept], normals[kept], features[kept]
     keypoints = _keypoints(points, normals, cfg, rng)
-    return Scan(
+    scan = Scan(
         _pad(points, cfg.max_points),
         _pad(normals, cfg.max_points),
         _pad(features, cfg.max_points),
@@ -78,22 +99,40 @@ def preprocess(points: np.ndarray, cfg: PreprocessConfig) -> Scan:
         _pad(keypoints.astype(np.int32), cfg.num_keypoints),
         _pad(np.ones(len(keypoints), bool), cfg.num_keypoints),
     )
+    return scan, None if times_s is None else _pad(cloud[rows[kept], 3], cfg.max_points)
 
 
-def _raw_scan(points: np.ndarray, cfg: PreprocessConfig, rng: np.random.Generator) -> Scan:
-    """Evenly spaced rows of what is in range, as they are, in random order, every one a key point (Ali et al. 2023, Sec. 4)."""
-    points = _crop(points, cfg)
-    num = min(len(points), cfg.max_points)
-    kept = rng.permutation(np.linspace(0, len(points), num, endpoint=False).astype(np.int64))
+def still(scan: Scan, times_s: np.ndarray, velocity: np.ndarray) -> Scan:
+    """A scan as measured, de-skewed: points and normals in the sensor frame at the stamp.
+
+    Features stay: what a surface is like does not change, and its range and height hardly do.
+
+    Args:
+        scan: of NumPy arrays.
+        times_s: (m,) of its points, relative to the stamp.
+        velocity: (6,) of the body, [omega rad/s, v m/s].
+    """
+    poses = sweep_poses(times_s, velocity)
+    points = np.einsum("nij,nj->ni", poses[:, :3, :3], scan.points) + np.where(scan.mask[:, None], poses[:, :3, 3], np.float32(0.0))
+    normals = np.einsum("nij,nj->ni", poses[:, :3, :3], scan.normals) if len(scan.normals) else scan.normals
+    return scan._replace(points=points, normals=normals)
+
+
+def _raw_scan(columns: np.ndarray, cfg: PreprocessConfig, rng: np.random.Generator) -> tuple[Scan, np.ndarray | None]:
+    """Evenly spaced rows, as they are, in random order, every one a key point (Ali et al. 2023, Sec. 4)."""
+    num = min(len(columns), cfg.max_points)
+    kept = columns[rng.permutation(np.linspace(0, len(columns), num, endpoint=False).astype(np.int64))]
     mask = _pad(np.ones(num, bool), cfg.max_points)
     nothing = np.zeros((0, 3), np.float32), np.zeros((0, NUM_FEATURES), np.float32)
-    return Scan(_pad(points[kept], cfg.max_points), *nothing, mask, np.arange(cfg.max_points, dtype=np.int32), mask)
+    scan = Scan(_pad(kept[:, :3], cfg.max_points), *nothing, mask, np.arange(cfg.max_points, dtype=np.int32), mask)
+    return scan, _pad(kept[:, 3], cfg.max_points) if kept.shape[1] > 3 else None
 
 
-def _crop(points: np.ndarray, cfg: PreprocessConfig) -> np.ndarray:
+def _crop(columns: np.ndarray, cfg: PreprocessConfig) -> np.ndarray:
+    """Rows whose first three columns, a point, are in range."""
     with np.errstate(invalid="ignore", over="ignore"):
-        squared_range = np.einsum("ij,ij->i", points, points)
-        return points[(squared_range >= cfg.min_range_m**2) & (squared_range < cfg.max_range_m**2)]  # NaN compares False
+        squared_range = np.einsum("ij,ij->i", columns[:, :3], columns[:, :3])
+        return columns[(squared_range >= cfg.min_range_m**2) & (squared_range < cfg.max_range_m**2)]  # NaN compares False
 
 
 def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:
@@ -102,22 +141,22 @@ def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 
 
-def voxel_mean(points: np.ndarray, size: float) -> np.ndarray:
-    """Mean of the points of every occupied voxel, (v, 3) float32."""
-    if len(points) == 0:
-        return points
-    keys = voxel_keys(points, size)
+def voxel_mean(columns: np.ndarray, size: float) -> np.ndarray:
+    """Mean of the rows in every occupied voxel, (v, c) float32; the first three columns are a point."""
+    if len(columns) == 0:
+        return columns
+    keys = voxel_keys(columns[:, :3], size)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
     counts = np.diff(np.r_[starts, len(keys)]).astype(np.float32)
-    return np.add.reduceat(points[order], starts, axis=0) / counts[:, None]
+    return np.add.reduceat(columns[order], starts, axis=0) / counts[:, None]
 
 
 def one_per_voxel(points: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
     """Row of one random point per occupied voxel, in random order."""
     order = rng.permutation(len(points))
-    _, first = np.unique(voxel_keys(points[order], size), return_index=True)
+    _, first = np.unique(voxel_keys(points[order, :3], size), return_index=True)
     return order[np.sort(first)]
 
 
@@ -127,10 +166,10 @@ def _describe(cloud: np.ndarray, rows: np.ndarray, cfg: PreprocessConfig):
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, NUM_FEATURES), np.float32), np.zeros(0, bool)
     points = cloud[rows]
     ranges = np.linalg.norm(points, axis=1)
-    radius = np.minimum(0.5 + 0.04 * ranges, 2.0)
+    radius = np.minimum(0.5 + 0.04 * ranges, MAX_RADIUS_M)
     tree = cKDTree(cloud, balanced_tree=False, compact_nodes=False)
     k = min(cfg.num_neighbors, len(cloud))
-    distances, index = tree.query(points, k=k, distance_upper_bound=2.0, workers=2)
+    distances, index = tree.query(points, k=k, distance_upper_bound=MAX_RADIUS_M, workers=2)
     near = distances <= radius[:, None]
     center, normal, eigenvalues = plane_fit(cloud[np.where(near, index, rows[:, None])], near)
     planar = eigenvalues[:, 0] < 0.1 * eigenvalues[:, 1]

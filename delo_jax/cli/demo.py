@@ -49,7 +49,7 @@ class Demo(Command):
             source=source,
             folder=self.out,
             weights=self.weights,
-            use_map=False,
+            use_map=True,
             deskew=True,
             stage="simulate",
             facts={
@@ -68,16 +68,15 @@ class Demo(Command):
         """The map that the estimated poses make of some scans."""
         from delo_jax.data.fields import FRAME_PERIOD_NS
         from delo_jax.geometry import se3
-        from delo_jax.pipeline.motion_model import ConstantVelocity
+        from delo_jax.geometry.deskew import deskew
         from delo_jax.report.figures import scene_figure
 
         clouds = {}
         for index, scan in source.kept.items():
             if not 0 < index < len(Ts_world_lidar) or scan.times is None:
                 continue
-            motion = ConstantVelocity()
-            motion.update(se3.inverse(Ts_world_lidar[index - 1]) @ Ts_world_lidar[index], 1e-9 * FRAME_PERIOD_NS)
-            clouds[index] = motion.deskew(scan.points, scan.times)
+            velocity = se3.log(se3.inverse(Ts_world_lidar[index - 1]) @ Ts_world_lidar[index]) / (1e-9 * FRAME_PERIOD_NS)
+            clouds[index] = deskew(scan.points, scan.times, velocity)
         if clouds:
             title = f"{len(clouds)} scans at the poses estimated"
             scene_figure(

@@ -94,7 +94,7 @@ def _works(name: str) -> Iterator[Check]:
     except DeloError as error:
         yield Check("self-test", f"not run: {error}", "give weights that can be used by --weights")
         return
-    yield Check("compiling odometry", f"{compile_model(params):.1f} s")
+    yield Check("compiling odometry", f"{compile_model(params, use_map=params.cfg.fine.num_iters > 0):.1f} s")
     begin = time.perf_counter()
     target, source = simulate_drive("mixed", 0, 2)
     yield Check("compiling the simulator", f"{time.perf_counter() - begin:.1f} s")

@@ -35,8 +35,8 @@ class Run(Command):
     """Folder for the results; runs/NAME, numbered, by default."""
     weights: str = "delo-base"
     """Released weights by name, or a .safetensors file."""
-    map: Literal["none", "local"] = "none"
-    """none: each scan is aligned with the last one; local: with a map of what was seen lately."""
+    map: Literal["local", "none"] = "local"
+    """local: scans are registered to a map of what was seen lately; none: to the last scan, by the network alone."""
     deskew: Literal["auto", "on", "off"] = "auto"
     """Undo the motion within a sweep. auto: where points carry times; on: also by azimuth, for scans as measured."""
     no_elevation_correction: bool = False

@@ -1,4 +1,4 @@
-"""`delo simulate`: a KITTI tree of a simulated drive."""
+"""`delo simulate`: a KITTI tree of a simulated drive that training has not seen."""
 
 import dataclasses
 import sys
@@ -16,18 +16,18 @@ SensorName = Literal["hdl64e", "hdl32e", "os1-128", "vlp16"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Simulate(Command):
-    """Scans of a simulated drive with exact poses, as a KITTI odometry tree.
+    """Scans of a long simulated drive with exact poses, as a KITTI odometry tree; training never uses these worlds.
 
-    Example: delo simulate drives --kind urban --num-scans 200 --rolling-shutter
+    Example: delo simulate drives --drive urban --num-scans 200 --rolling-shutter
     """
 
     out: tyro.conf.Positional[Path]
     """Root of the tree; sequences that are in it already are left alone."""
-    kind: Kind = "mixed"
-    """What stands beside the road."""
+    drive: Kind = "mixed"
+    """What stands beside the road: a city, houses with gardens, a mixture, a country road, or open land with vegetation."""
     seed: int = 0
-    """Of the world, the motion, the sensor and the noise."""
-    num_scans: int = 100
+    """Of the world, the motion, the sensor and the noise; from 0 to 499999."""
+    num_scans: int = 130
     """Length of the drive; ten scans are a second."""
     sensor: SensorName = "hdl64e"
     """Model of the spinning LiDAR."""
@@ -37,13 +37,13 @@ class Simulate(Command):
     def run(self) -> int:
         """Writes the tree and prints how to go on."""
         require(self.num_scans >= 1, "num_scans", "at least 1", self.num_scans)
-        require(self.seed >= 0, "seed", "0 or more", self.seed)
         from delo_jax.cli.console import Row, interruptible, print_summary, progress
         from delo_jax.data.writers import KittiTreeWriter
-        from delo_jax.sim import simulate_drive
+        from delo_jax.sim.drive import DRIVE_SEED, LAST_DRIVE_SEED, simulate_drive
 
-        name = f"{self.kind}-{self.seed}"
-        drive = simulate_drive(self.kind, self.seed, self.num_scans, self.sensor, rolling_shutter=self.rolling_shutter)
+        last, name = LAST_DRIVE_SEED - DRIVE_SEED, f"{self.drive}-{self.seed}"
+        require(0 <= self.seed <= last, "seed", f"0 to {last}, whose worlds training never uses", self.seed)
+        drive = simulate_drive(self.drive, DRIVE_SEED + self.seed, self.num_scans, self.sensor, rolling_shutter=self.rolling_shutter)
         count, num_points, path = 0, 0, 0.0
         position = None
         writer = KittiTreeWriter(self.out, name, motion_compensated=not self.rolling_shutter)
@@ -61,6 +61,7 @@ class Simulate(Command):
             Row("scans", str(count)),
             Row("points per scan (mean)", f"{num_points / max(count, 1):.0f}"),
             Row("path", f"{path:.1f}", "m"),
+            Row("truth", f"exact, in poses/{name}.txt"),
             Row("motion within a sweep", "in the points" if self.rolling_shutter else "compensated"),
             Row("elevation correction", "none needed; calib.txt says so"),
         ]

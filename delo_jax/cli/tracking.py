@@ -24,6 +24,7 @@ from delo_jax.data.fields import RawScan
 from delo_jax.errors import ConfigError, ScanError
 from delo_jax.model.delo import Model
 from delo_jax.pipeline.lidar_odometry import Frame, LidarOdometry
+from delo_jax.pipeline.scan_to_map import compile_steps
 from delo_jax.pipeline.trajectory import RunWriter, Trajectory
 from delo_jax.report.figures import trajectory_figure
 
@@ -108,11 +109,13 @@ def new_folder(asked: Path | None, name: str) -> Path:
     return asked
 
 
-def compile_model(params: Model) -> float:
+def compile_model(params: Model, *, use_map: bool) -> float:
     """Compiles everything that odometry will call, and returns how long it took [s]: shapes are fixed, so a scan without points does."""
     begin = time.perf_counter()
     empty = inference.prepare(params, np.zeros((0, 3), np.float32))
     inference.align(params, empty, empty, np.eye(4))
+    if use_map:
+        compile_steps(params)
     return time.perf_counter() - begin
 
 
@@ -124,7 +127,7 @@ def track(job: Job) -> Result:
     """
     params, card = weights.load(job.weights), weights.read_card(job.weights)
     with working("compiling"):
-        compile_s = compile_model(params)
+        compile_s = compile_model(params, use_map=job.use_map)
     print(f"compiled in {compile_s:.1f} s")
     facts = _facts(job, card, compile_s)
     try:

@@ -32,11 +32,13 @@ class PreprocessConfig:
     """Points nearer than this are the vehicle itself."""
     max_range_m: float = 75.0
     """Points farther than this are dropped."""
-    voxel_m: float = 0.2
+    max_raw_points: int = 65_536
+    """Of a scan of more points, every second, third, ... one is used."""
+    voxel_m: float = 0.3
     """Voxel size of the cloud in which neighbours are sought."""
-    point_voxel_m: float = 0.7
+    point_voxel_m: float = 0.9
     """One point is kept per voxel of this size."""
-    num_neighbors: int = 16
+    num_neighbors: int = 8
     """Neighbours of the plane fit."""
     max_points: int = 3072
     """M: points kept, and the padded length of every scan."""
@@ -52,7 +54,7 @@ class PreprocessConfig:
     def __post_init__(self):
         require_one_of(self.sampling, "preprocess.sampling", SAMPLINGS)
         require(0.0 <= self.min_range_m < self.max_range_m, "preprocess.min_range_m", "0 <= min_range_m < max_range_m", self.min_range_m)
-        require_positive(self, "preprocess.", "keypoint_voxel_m", "keypoint_range_m")
+        require_positive(self, "preprocess.", "max_raw_points", "keypoint_voxel_m", "keypoint_range_m")
         require(0.0 < self.voxel_m <= self.point_voxel_m, "preprocess.voxel_m", "0 < voxel_m <= point_voxel_m", self.voxel_m)
         require(self.num_neighbors >= 5, "preprocess.num_neighbors", "at least 5", self.num_neighbors)
         require(0.0 < self.ground_share <= 1.0, "preprocess.ground_share", "a value in (0, 1]", self.ground_share)

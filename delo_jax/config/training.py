@@ -36,6 +36,10 @@ class TrainConfig:
     """Pairs per step."""
     num_points: int = 512
     """Source points of the fine stage in training."""
+    map_share: float = 0.6
+    """Share of the pairs whose fine stage learns against a local map of 2 to 5 frames rather than one scan."""
+    num_map_points: int = 4096
+    """Surfaces of such a map, the nearest ones, at most; no fewer than a scan has points."""
     num_iters: int = 4
     """Fine iterations in training, pose detached between them."""
     learning_rate: float = 2e-3
@@ -77,6 +81,9 @@ class TrainConfig:
         require_one_of(self.matching_loss, "matching_loss", ("scores", "plan"))
         for name in ("seed", "num_epochs", "clip_norm", "warmup_steps"):
             require(getattr(self, name) >= 0, name, "at least 0", getattr(self, name))
+        require(0.0 <= self.map_share <= 1.0, "map_share", "a value in [0, 1]", self.map_share)
+        enough = not self.fine_weight or self.num_map_points >= self.model.preprocess.max_points
+        require(enough, "num_map_points", "at least model.preprocess.max_points", self.num_map_points)
         for name in ("num_steps", "num_evidence_steps"):
             require(getattr(self, name) == 0 or getattr(self, name) >= 10, name, "0 or at least 10", getattr(self, name))
         weights = "matching_weight", "fine_weight", "odometry_weight", "aux_weight", "evidence_weight"

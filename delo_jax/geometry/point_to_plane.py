@@ -6,8 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from delo_jax.config import LEVER_M
 from delo_jax.geometry import se3
 from delo_jax.geometry.se3 import full_float32
+
+SWEEP_S = 0.03  # about the spread of times in a sweep; conditions the velocity's part of the system
 
 
 class PlaneStep(NamedTuple):
@@ -130,22 +133,109 @@ def robust_point_to_plane(
     no_tangential = jnp.zeros(points.shape[0], points.dtype)
 
     def weigh(T):
-        moved, turned = se3.transform(T, points), normals @ T[:3, :3].T
-        offset = moved - targets
-        distance2 = jnp.sum(offset * target_normals, axis=1) ** 2
-        near = jnp.sum(offset * offset, axis=1) < reach_m**2
-        agrees = jnp.sum(turned * target_normals, axis=1) > 0.5**0.5
-        weights = jnp.where(mask & near & agrees, (scale_m**2 / (scale_m**2 + distance2)) ** 2, 0.0)
-        return moved, weights, distance2
+        moved = se3.transform(T, points)
+        return moved, *_robust_weights(moved, normals @ T[:3, :3].T, mask, targets, target_normals, scale_m, reach_m)
 
     def iterate(T, _):
         moved, weights, _ = weigh(T)
         return point_to_plane_step(moved, targets, target_normals, weights, no_tangential, damping=0.0).T_delta @ T, None
 
     T, _ = jax.lax.scan(iterate, T_init, length=num_steps)
-    moved, weights, distance2 = weigh(T)
+    moved, weights, distance = weigh(T)
     total = jnp.sum(weights) + 1e-9
     information = point_to_plane_step(moved, targets, target_normals, weights, no_tangential, damping=0.0).information
     Ad = se3.adjoint(T)
-    rms = jnp.sqrt(jnp.sum(weights * distance2) / total)
+    rms = jnp.sqrt(jnp.sum(weights * distance**2) / total)
     return RobustFit(T, total / jnp.maximum(jnp.sum(mask.astype(points.dtype)), 1.0), rms, Ad.T @ information @ Ad / total)
+
+
+def _robust_weights(moved, turned, mask, targets, target_normals, scale_m, reach_m):
+    """Weight of each match, and its signed distance to the target's plane."""
+    offset = moved - targets
+    distance = jnp.sum(offset * target_normals, axis=1)
+    near = jnp.sum(offset * offset, axis=1) < reach_m**2
+    agrees = jnp.sum(turned * target_normals, axis=1) > 0.5**0.5
+    return jnp.where(mask & near & agrees, (scale_m**2 / (scale_m**2 + distance**2)) ** 2, 0.0), distance
+
+
+class SweepFit(NamedTuple):
+    """Where a few robust steps on pose and velocity ended."""
+
+    T_target_source: Float[Array, "4 4"]
+    velocity: Float[Array, "6"]
+    """Of the body, order [omega rad/s, v m/s], that the points still have to be de-skewed with."""
+    score: Float[Array, ""]
+    rms_m: Float[Array, ""]
+    information: Float[Array, "6 6"]
+    """As in `RobustFit`, of the pose with the velocity free: what a turn of the sweep could also explain is not known."""
+
+
+@full_float32
+def robust_sweep_to_plane(
+    points: Float[Array, "n 3"],
+    normals: Float[Array, "n 3"],
+    mask: Bool[Array, " n"],
+    times_s: Float[Array, " n"],
+    targets: Float[Array, "n 3"],
+    target_normals: Float[Array, "n 3"],
+    T_init: Float[Array, "4 4"],
+    velocity_prior: Float[Array, "6"],
+    *,
+    scale_m: float,
+    reach_m: float,
+    num_steps: int,
+    sigma_velocity: tuple[float, float],
+    sigma_m: float,
+) -> SweepFit:
+    """The same for a sweep whose points were measured while the sensor moved: its velocity is solved for with its pose.
+
+    A point measured at t relative to the stamp lies at T (x + t (omega x x + v)), so that twelve numbers are estimated
+    (Dellenbach et al. 2022 let a pose at either end of the sweep go free). The velocity is held by a prior, since some
+    of it, along a straight street, hardly moves a plane.
+
+    Args:
+        points: as measured, or de-skewed with some velocity, which the one found here comes on top of [m].
+        normals: theirs, unit.
+        mask: True where a source point is real.
+        times_s: of each, relative to the stamp.
+        targets: target of each source point [m].
+        target_normals: theirs, unit.
+        T_init: T_target_source to start from.
+        velocity_prior: (6,) expected of the velocity found here: 0 where points are de-skewed with the expected one.
+        scale_m: distance at which a match counts a quarter [m].
+        reach_m: a match farther apart than this is none [m].
+        num_steps: static.
+        sigma_velocity: standard deviations of the prior [rad/s, m/s].
+        sigma_m: standard deviation of the mean plane distance of all matches [m].
+    """
+    lever = jnp.repeat(jnp.array([1.0 / LEVER_M, 1.0], points.dtype), 3)
+    scale = jnp.concatenate([lever, lever / SWEEP_S])
+    pull = jnp.repeat((sigma_m / jnp.array(sigma_velocity, points.dtype)) ** 2, 3)
+
+    def place(T, velocity):
+        swept = points + times_s[:, None] * (jnp.cross(velocity[None, :3], points) + velocity[None, 3:])
+        moved = se3.transform(T, swept)
+        weights, distance = _robust_weights(moved, normals @ T[:3, :3].T, mask, targets, target_normals, scale_m, reach_m)
+        direction = target_normals @ T[:3, :3]  # in the source frame
+        row = jnp.concatenate([jnp.cross(swept, direction), direction], axis=1)
+        rows = jnp.concatenate([row, times_s[:, None] * row], axis=1) * scale[None, :]
+        share = weights / (jnp.sum(weights) + 1e-9)
+        hessian = rows.T @ (share[:, None] * rows) + jnp.diag(jnp.concatenate([jnp.zeros(6), pull]) * scale**2)
+        return weights, distance, share, rows, hessian
+
+    def iterate(state, _):
+        T, velocity = state
+        _, distance, share, rows, hessian = place(T, velocity)
+        gradient = rows.T @ (share * distance)
+        gradient = gradient.at[6:].add(pull * (velocity - velocity_prior) * scale[6:])
+        factor = jax.scipy.linalg.cho_factor(hessian + 1e-6 * jnp.eye(12, dtype=points.dtype), lower=True)
+        step = -scale * jax.scipy.linalg.cho_solve(factor, gradient)
+        return (T @ se3.exp(step[:6]), velocity + step[6:]), None
+
+    (T, velocity), _ = jax.lax.scan(iterate, (T_init, jnp.zeros_like(velocity_prior)), length=num_steps)
+    weights, distance, share, _, hessian = place(T, velocity)
+    coupling = hessian[:6, 6:]
+    marginal = hessian[:6, :6] - coupling @ jnp.linalg.solve(hessian[6:, 6:] + 1e-9 * jnp.eye(6, dtype=points.dtype), coupling.T)
+    count = jnp.maximum(jnp.sum(mask.astype(points.dtype)), 1.0)
+    rms = jnp.sqrt(jnp.sum(share * distance**2))
+    return SweepFit(T, velocity, jnp.sum(weights) / count, rms, marginal / (lever[:, None] * lever[None, :]))

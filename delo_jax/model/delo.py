@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Key
 from delo_jax.config import DeloConfig
 from delo_jax.geometry import se3
 from delo_jax.geometry.point_to_plane import point_to_plane_step
-from delo_jax.geometry.se3 import full_float32
+from delo_jax.geometry.se3 import AnyArray, full_float32
 from delo_jax.model import fine
 from delo_jax.model.attention import CloudContext
 from delo_jax.model.coarse import CoarsePose, coarse_pose
@@ -106,6 +106,15 @@ class Encoding(NamedTuple):
     context: CloudContext  # without rows where the preset has no transformer
 
 
+class Surfaces(NamedTuple):
+    """Points with normals and features: of a scan, or of a map as seen from one pose."""
+
+    points: Float[AnyArray, "n 3"]  # [m]
+    normals: Float[AnyArray, "n 3"]  # unit, towards the sensor
+    features: Float[AnyArray, "n f"]  # as `preprocess` computes them
+    mask: Bool[AnyArray, " n"]
+
+
 class Matching(NamedTuple):
     """Plan between the key points of two scans, with the descriptors it was made of."""
 
@@ -166,20 +175,24 @@ def refine_pose(model: Applicable, source: fine.Cloud, target: fine.Cloud, T_ini
     return fine.refine(model.confidence, source, target, T_init, num_iters=num_iters, cfg=model.cfg.fine)
 
 
+def cloud_of(model: Applicable, seen: Surfaces) -> fine.Cloud:
+    """Surfaces as the fine stage wants them."""
+    embedding = model.apply("embed", seen.features)
+    return fine.Cloud(jnp.asarray(seen.points), jnp.asarray(seen.normals), embedding, jnp.asarray(seen.mask))
+
+
 @full_float32
-def fine_step(model: Applicable, source: fine.Cloud, points, normals, features, T_init: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
+def fine_step(model: Applicable, source: Surfaces, target: Surfaces, T_init: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
     """One iteration of the fine stage towards given matches, for a caller that finds neighbours itself.
 
     Args:
         model: weights and config.
         source: n points of the source scan.
-        points: (n, 3) target of each [m].
-        normals: (n, 3) of the targets.
-        features: (n, f) of the targets, seen from where the target frame is.
+        target: the match of each, with the features that are seen from where the target frame is; its mask is not read.
         T_init: T_target_source before the step.
     """
-    matched = fine.Cloud(points, normals, model.apply("embed", features), source.mask)
-    T_delta, _ = fine.step(fine.weigh(model.confidence, source, matched, T_init), cfg=model.cfg.fine)
+    ours, theirs = cloud_of(model, source), cloud_of(model, target)
+    T_delta, _ = fine.step(fine.weigh(model.confidence, ours, theirs, T_init), cfg=model.cfg.fine)
     return T_delta @ T_init
 
 

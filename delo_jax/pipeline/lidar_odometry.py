@@ -11,10 +11,10 @@ from delo_jax import inference
 from delo_jax.data.fields import FRAME_PERIOD_NS, MAX_SWEEP_S
 from delo_jax.errors import ScanError
 from delo_jax.geometry import se3
-from delo_jax.inference import EncodedScan, Estimate
+from delo_jax.inference import Estimate, PreparedScan
 from delo_jax.model.delo import Model
-from delo_jax.pipeline.motion_model import NANOSECOND, ConstantVelocity
-from delo_jax.pipeline.scan_to_map import MapTracker
+from delo_jax.pipeline.motion_model import NANOSECOND, ConstantVelocity, is_near
+from delo_jax.pipeline.scan_to_map import Located, MapTracker, Steps
 from delo_jax.pipeline.trajectory import Trajectory
 from delo_jax.preprocess import check_points
 from delo_jax.uncertainty import covariance
@@ -38,18 +38,10 @@ class Frame(NamedTuple):
     """Seconds per stage."""
 
 
-class Sweep(NamedTuple):
-    """A scan as measured."""
-
-    points: np.ndarray  # (n, 3), each in the sensor frame at its own time [m]
-    times_s: np.ndarray  # (n,) relative to the stamp
-
-
 class Source(NamedTuple):
     """A scan that later ones may be aligned with."""
 
-    scan: EncodedScan
-    skewed: Sweep | None  # what `scan` was made of, as long as no motion is known that could de-skew it
+    scan: PreparedScan
     stamp_ns: int
     number: int  # of its frame
 
@@ -76,22 +68,24 @@ class LidarOdometry:
         params: weights, from `delo_jax.load`.
         use_map: register to a local map of what was seen lately, rather than to the last scan.
         deskew: undo the motion within a sweep where points carry times.
-        prepare: raw points to an encoded scan; `inference.prepare` by default.
-        align: two encoded scans and a start to an estimate; `inference.align` by default.
+        steps: how a scan is registered to the map.
+        prepare: raw points and their times to a scan; `inference.prepare` by default.
+        align: two scans and a start to an estimate; `inference.align` by default.
     """
 
     def __init__(
         self,
         params: Model,
         *,
-        use_map: bool = False,
+        use_map: bool = True,
         deskew: bool = True,
-        prepare: Callable[[Model, np.ndarray], EncodedScan] = inference.prepare,
-        align: Callable[[Model, EncodedScan, EncodedScan, np.ndarray], Estimate] = inference.align,
+        steps: Steps | None = None,
+        prepare: Callable[[Model, np.ndarray, np.ndarray | None], PreparedScan] = inference.prepare,
+        align: Callable[[Model, PreparedScan, PreparedScan, np.ndarray], Estimate] = inference.align,
     ):
         self._params, self._deskew, self._prepare, self._align = params, deskew, prepare, align
         self._motion_model = ConstantVelocity()
-        self._map = MapTracker(params) if use_map else None
+        self._map = MapTracker(params, steps or Steps()) if use_map else None
         self._anchor: Anchor | None = None  # the last good scan
         self._doubtful: Anchor | None = None  # the newest usable scan that did not fit it
         self._num_frames, self._last_stamp_ns, self._num_rejected = 0, 0, 0
@@ -112,12 +106,8 @@ class LidarOdometry:
         points, stamp_ns = check_points(points), self._check_stamp(stamp_ns)
         times_s = self._check_times(times_s, len(points))
         begin = time.perf_counter()
-        sweep = None if times_s is None else Sweep(points, times_s)
-        scan = self._prepare(self._params, points) if sweep is None else self._prepare_still(sweep, self._motion_model)
-        skewed = None
-        if sweep is not None and self._motion_model.velocity is None:
-            skewed = Sweep(points.copy(), sweep.times_s.copy())
-        target = Source(scan, skewed, stamp_ns, self._num_frames)
+        scan = self._prepare(self._params, points, times_s).still(self._motion_model.velocity)
+        target = Source(scan, stamp_ns, self._num_frames)
         prepared = time.perf_counter()
         motion, target = self._locate(target) if self._map is None else self._locate_on_map(target, self._map)
         timing = {"prepare": prepared - begin, "solve": time.perf_counter() - prepared}
@@ -152,9 +142,6 @@ class LidarOdometry:
             raise ScanError(f"times_s: expected seconds relative to the stamp, within {MAX_SWEEP_S:g} s, got {farthest_s:g} s")
         return times_s
 
-    def _prepare_still(self, sweep: Sweep, motion: ConstantVelocity) -> EncodedScan:
-        return self._prepare(self._params, motion.deskew(*sweep))
-
     def _locate(self, target: Source) -> tuple[Estimate, Source]:
         """Motion to a new scan from the last good one, or from a doubtful one that it fits better; the scan as it was aligned."""
         if self._anchor is None:
@@ -169,25 +156,43 @@ class LidarOdometry:
 
     def _locate_on_map(self, target: Source, tracker: MapTracker) -> tuple[Estimate, Source]:
         """Motion to a new scan by the map, from the motion model's prediction; where that is bad, from the network's proposal."""
-        anchor, motion = self._anchor, None
-        if anchor is None:
+        if self._anchor is None:
             return self._first(target), target
-        if self._motion_model.velocity is not None:
-            guess = self._motion_model.predict((target.stamp_ns - anchor.source.stamp_ns) * NANOSECOND)
-            motion = tracker.locate(target.scan, anchor.T_world_lidar, guess)
-            if motion.status in ("ok", "degenerate"):
-                return motion, target
+        expected = None
+        if self._motion_model.velocity is not None and self._motion_model.earlier is None:
+            elapsed_s = self._elapsed_s(self._anchor.source, target)
+            guess = self._motion_model.predict(elapsed_s)
+            expected = tracker.locate(target.scan, self._anchor.T_world_lidar, [guess], elapsed_s, recovering=False)
+            if expected.motion.status in ("ok", "degenerate") and is_near(guess, expected.motion.T_target_source):
+                return expected.motion, target._replace(scan=expected.scan)
+        return self._recover(target, tracker, expected)
+
+    def _recover(self, target: Source, tracker: MapTracker, expected: Located | None) -> tuple[Estimate, Source]:
+        """Motion to a scan that is not where it was expected, or of which nothing was expected: the best of several hypotheses.
+
+        The network aligns it with the last good scan; the map judges that pose and the predicted ones, each from two subsets of
+        points. Where the network is sure and the map has none that fits, a new map begins.
+        """
+        before = self._anchor
         pair, aligned = self._locate(target)
-        if pair.status == "rejected":
-            return motion or pair, target
-        since = self._anchor or anchor
-        if since is not anchor:  # a doubtful scan took over: where it is on the old map, nobody knows
+        since = self._anchor
+        assert since is not None
+        if since is not before:  # a doubtful scan took over: where it is on the old map, nobody knows
+            expected = None
+        if since is not before or self._motion_model.velocity is None:
             tracker.restart(since.source.scan, since.T_world_lidar)
-            motion = None
-        proposed = tracker.locate(aligned.scan, since.T_world_lidar, pair.T_target_source, recovering=True)
-        if motion is not None and motion.confidence >= proposed.confidence:
-            return motion, target
-        return proposed, aligned
+        elapsed_s = self._elapsed_s(since.source, target)
+        guesses = self._motion_model.predictions(elapsed_s)
+        if pair.status != "rejected":
+            guesses.append(pair.T_target_source)
+        found = tracker.locate(aligned.scan, since.T_world_lidar, guesses, elapsed_s, recovering=True)
+        if expected is not None and expected.motion.confidence >= found.motion.confidence:
+            found = expected
+        if found.motion.status == "rejected" and pair.status == "ok":
+            tracker.restart(since.source.scan, since.T_world_lidar)
+            reason = f"the map does not fit ({found.motion.reason}); aligned with the last good scan alone"
+            return dataclasses.replace(pair, status="low_confidence", reason=reason), aligned
+        return found.motion, aligned._replace(scan=found.scan)
 
     def _first(self, target: Source) -> Estimate:
         """The first scan is the world, unless it is unusable."""
@@ -198,18 +203,24 @@ class LidarOdometry:
 
     def _align_to(self, source: Source, target: Source) -> tuple[Estimate, Source]:
         """Motion T_source_target of a pair, started from the motion model's prediction, and the target as it was aligned."""
-        elapsed_s = (target.stamp_ns - source.stamp_ns) * NANOSECOND
+        elapsed_s = self._elapsed_s(source, target)
         guess = se3.inverse(self._motion_model.predict(elapsed_s))
         estimate = self._align(self._params, source.scan, target.scan, guess)
-        if source.skewed and target.skewed and estimate.status != "rejected":
+        if self._motion_model.velocity is None and estimate.status != "rejected":
             # the first motion de-skews its own two scans, then is measured again
-            motion = ConstantVelocity()
-            motion.update(se3.inverse(estimate.T_target_source), elapsed_s)
-            scans = [self._prepare_still(sweep, motion) for sweep in (source.skewed, target.skewed)]
-            again = self._align(self._params, scans[0], scans[1], estimate.T_target_source)
-            if again.status != "rejected":
-                estimate, target = again, target._replace(scan=scans[1])
+            velocity = se3.log(se3.inverse(estimate.T_target_source)) / elapsed_s
+            scans = source.scan.still(velocity), target.scan.still(velocity)
+            if scans[0] is not source.scan and scans[1] is not target.scan:
+                again = self._align(self._params, *scans, estimate.T_target_source)
+                if again.status != "rejected":
+                    estimate, target = again, target._replace(scan=scans[1])
+                    if self._anchor is not None and self._anchor.source is source:
+                        self._anchor = self._anchor._replace(source=source._replace(scan=scans[0]))
         return estimate.inverted(), target
+
+    @staticmethod
+    def _elapsed_s(source: Source, target: Source) -> float:
+        return (target.stamp_ns - source.stamp_ns) * NANOSECOND
 
     def _unmeasured(self, stamp_ns: int, reason: str) -> Estimate:
         """What the motion model says of a motion that was not measured."""

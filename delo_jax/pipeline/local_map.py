@@ -6,18 +6,11 @@ import numpy as np
 
 from delo_jax.config import NUM_FEATURES
 from delo_jax.geometry import se3
+from delo_jax.model.delo import Surfaces
 from delo_jax.preprocess import posed_features, voxel_keys
 
 SAME_SURFACE = 0.5  # cosine between normals above which two observations are of one surface
 MUCH_NEARER = 0.5  # of the range at which a voxel was seen: a nearer observation replaces it
-
-
-class Surfaces(NamedTuple):
-    """Points with normals and features, as the network sees them from one pose."""
-
-    points: np.ndarray  # (n, 3) float32 [m]
-    normals: np.ndarray  # (n, 3) float32, unit, towards the sensor
-    features: np.ndarray  # (n, f) float32
 
 
 class _Voxels(NamedTuple):
@@ -73,13 +66,14 @@ class LocalMap:
 
     def _observed(self, seen: Surfaces, T_world_lidar: np.ndarray) -> _Voxels:
         """A scan as voxels seen once."""
-        world = se3.transform(T_world_lidar, seen.points.astype(np.float64))
-        normals = (seen.normals @ T_world_lidar[:3, :3].T).astype(np.float32)
-        ranges = np.linalg.norm(seen.points, axis=1).astype(np.float32)
+        points, normals, features = (np.asarray(array)[np.asarray(seen.mask)] for array in seen[:3])
+        world = se3.transform(T_world_lidar, points.astype(np.float64))
+        normals = (normals @ T_world_lidar[:3, :3].T).astype(np.float32)
+        ranges = np.linalg.norm(points, axis=1).astype(np.float32)
         keys = voxel_keys(world, self._voxel_m)
         order = np.lexsort((ranges, keys))
         first = order[np.flatnonzero(np.r_[True, keys[order][1:] != keys[order][:-1]])] if len(order) else order
-        return _Voxels(keys, world, normals, seen.features, ranges, np.ones(len(keys), np.float32)).rows(first)
+        return _Voxels(keys, world, normals, features, ranges, np.ones(len(keys), np.float32)).rows(first)
 
     def _average(self, held: _Voxels, rows: np.ndarray, new: _Voxels) -> None:
         """Observations of voxels that are there already."""
@@ -104,14 +98,14 @@ class LocalMap:
         """The map within reach of a pose, in the sensor frame there, with the features that a sensor there would see."""
         if self._voxels is None:
             nothing = np.zeros((0, 3), np.float32)
-            return Surfaces(nothing, nothing, np.zeros((0, NUM_FEATURES), np.float32))
+            return Surfaces(nothing, nothing, np.zeros((0, NUM_FEATURES), np.float32), np.zeros(0, bool))
         near = self._voxels.rows(_near(self._voxels, T_world_lidar, reach_m))
         R = T_world_lidar[:3, :3]
         points = ((near.points - T_world_lidar[:3, 3]) @ R).astype(np.float32)
         normals = (near.normals @ R).astype(np.float32)
         normals = np.where(np.einsum("ij,ij->i", normals, points)[:, None] > 0, -normals, normals)
         ranges = np.maximum(np.linalg.norm(points, axis=1), 1e-3)
-        return Surfaces(points, normals, posed_features(near.features, ranges, points, normals))
+        return Surfaces(points, normals, posed_features(near.features, ranges, points, normals), np.ones(len(points), bool))
 
 
 def _near(voxels: _Voxels, T_world_lidar: np.ndarray, reach_m: float) -> np.ndarray:

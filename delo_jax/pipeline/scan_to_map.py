@@ -1,7 +1,9 @@
 """Scan to local map: learned steps for the wide basin, robust classical steps for the last millimetres."""
 
+import dataclasses
 from collections import deque
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -10,22 +12,41 @@ from scipy.spatial import cKDTree
 from delo_jax import inference
 from delo_jax.errors import ConfigError
 from delo_jax.geometry import se3
-from delo_jax.inference import EncodedScan, Estimate
-from delo_jax.model.delo import Model
-from delo_jax.pipeline.local_map import LocalMap, Surfaces
+from delo_jax.inference import Estimate, PreparedScan
+from delo_jax.model.delo import Model, Surfaces
+from delo_jax.pipeline.local_map import LocalMap
 from delo_jax.uncertainty import covariance, status
 from delo_jax.uncertainty.observability import observability
 
 CROP_M = 60.0  # of the map around the predicted pose
 NUM_LEARNED_POINTS, NUM_ROBUST_POINTS = 512, 2048
-NUM_ROBUST_ROUNDS, STEPS_PER_ROUND = 2, 2  # matches are found again once a round
+STEPS_PER_ROUND = 2  # robust steps between two searches for matches
 SCALE_M, REACH_M = 0.1, 0.8
+SWEEP_OPTIONS: dict[str, Any] = {
+    "scale_m": SCALE_M,
+    "reach_m": REACH_M,
+    "num_steps": STEPS_PER_ROUND,
+    "sigma_velocity": (0.17, 0.2),  # of that at the stamp, about the mean since the last scan [rad/s, m/s]
+    "sigma_m": 0.002,  # of the mean plane distance of a scan
+}
 MIN_TARGETS = 100
-RECOVERY_STEPS = 6
+RECOVERY_STEPS = 12
 INSERT_M, INSERT_DEG = 1.0, 5.0  # motion since the last insertion
 NUM_RECENT = 20  # scans whose scores say what is usual
 MIN_USUAL_SCORE = 0.35
 SIGMA_M, NUM_INDEPENDENT = 0.02, 100.0  # of a plane distance; as many of them as if they were independent; not calibrated
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Steps:
+    """How a scan is registered; other numbers are for comparison."""
+
+    num_learned: int = 2
+    """Learned steps from a prediction; where it may be far off, 12."""
+    num_robust: int = 4
+    """Classical steps after them; even."""
+    num_passes: int = 2
+    """2: de-skewed with the predicted velocity, and once more with the one found; 1: not again."""
 
 
 class MapFix(NamedTuple):
@@ -37,25 +58,137 @@ class MapFix(NamedTuple):
     information: np.ndarray  # (6, 6), right perturbation, per unit of weight
 
 
+class Located(NamedTuple):
+    """Where a scan is."""
+
+    motion: Estimate  # T_since_current
+    scan: PreparedScan  # as it was registered: de-skewed with this motion
+
+
+class Surroundings:
+    """The map around a start, in the sensor frame there, so that its features are those that a sensor there would see.
+
+    Neighbours are found by a tree on the host between jitted steps: less than a millisecond a round, where XLA on a CPU
+    needs several.
+    """
+
+    def __init__(self, local_map: LocalMap, T_world_start: np.ndarray):
+        self._seen = local_map.crop(T_world_start, CROP_M)
+        self.usable = len(self._seen.points) >= MIN_TARGETS
+        self._tree = cKDTree(self._seen.points, balanced_tree=False, compact_nodes=False)
+
+    def matches(self, source: Surfaces, T: np.ndarray) -> Surfaces:
+        """The nearest surface to each of n points at T_start_lidar; there must be one."""
+        index = self._tree.query(np.asarray(source.points) @ T[:3, :3].T + T[:3, 3])[1]
+        return Surfaces(*(array[index] for array in self._seen))
+
+
+def register(
+    params: Model, scan: PreparedScan, near: Surroundings, T_start_init: np.ndarray, *, num_learned: int, num_robust: int, skip: int = 0
+) -> MapFix:
+    """Pose of a scan near a start; score 0 where there is no map.
+
+    Args:
+        params: weights.
+        scan: to register.
+        near: the map around the start.
+        T_start_init: (4, 4) where to begin.
+        num_learned: steps of the fine stage, on 512 points.
+        num_robust: classical steps after them, on 2048 points.
+        skip: points that the learned steps leave out: another subset is another chance.
+    """
+    nowhere = MapFix(np.eye(4), 0.0, np.inf, np.zeros((6, 6)))
+    if not near.usable:
+        return nowhere
+    T = T_start_init.astype(np.float32)
+    first = min(skip, max(scan.num_points - NUM_LEARNED_POINTS, 0))
+    source = surfaces_of(scan, slice(first, first + NUM_LEARNED_POINTS))
+    for _ in range(num_learned):
+        T = np.asarray(inference.fine_step(params, source, near.matches(source, T), T))
+    source = surfaces_of(scan, slice(0, NUM_ROBUST_POINTS))
+    for num_steps in [STEPS_PER_ROUND] * (num_robust // STEPS_PER_ROUND) or [0]:
+        fit = _robust(source, near.matches(source, T), T, num_steps)
+        T = fit.T_target_source
+    if not (np.isfinite(T).all() and np.isfinite(fit.information).all()):
+        return nowhere
+    T_start_lidar = se3.exp(se3.log(T.astype(np.float64)))  # orthonormal to float64
+    return MapFix(T_start_lidar, float(fit.score), float(fit.rms_m), np.asarray(fit.information, np.float64))
+
+
+def register_sweep(
+    scan: PreparedScan, near: Surroundings, fix: MapFix, velocity: np.ndarray, num_rounds: int
+) -> tuple[PreparedScan, MapFix]:
+    """A sweep registered once more, its velocity solved for with its pose; the scan as de-skewed with it.
+
+    Args:
+        scan: with times.
+        near: the map that it was registered to.
+        fix: where it is, de-skewed with another velocity.
+        velocity: (6,) expected, [omega rad/s, v m/s].
+        num_rounds: searches for matches, each after a new de-skew.
+    """
+    times_s = np.asarray(scan.times_s)[:NUM_ROBUST_POINTS]
+    found = velocity
+    for _ in range(num_rounds):
+        scan = scan.still(found)
+        fit = _sweep(scan, times_s, near, fix.T_start_lidar.astype(np.float32), velocity - found)
+        if not (np.isfinite(fit.T_target_source).all() and np.isfinite(fit.velocity).all()):
+            break
+        found = found + fit.velocity
+        T_start_lidar = se3.exp(se3.log(fit.T_target_source.astype(np.float64)))
+        fix = MapFix(T_start_lidar, float(fit.score), float(fit.rms_m), np.asarray(fit.information, np.float64))
+    return scan.still(found), fix
+
+
+def _sweep(scan: PreparedScan, times_s: np.ndarray, near: Surroundings, T: np.ndarray, velocity_prior: np.ndarray):
+    source = surfaces_of(scan, slice(0, NUM_ROBUST_POINTS))
+    matched = near.matches(source, T)
+    rows = source.points, source.normals, source.mask, times_s, matched.points, matched.normals
+    return jax.device_get(inference.sweep_steps(*rows, T, velocity_prior.astype(np.float32), **SWEEP_OPTIONS))
+
+
+def _robust(source: Surfaces, matched: Surfaces, T: np.ndarray, num_steps: int):
+    rows = source.points, source.normals, source.mask, matched.points, matched.normals
+    return jax.device_get(inference.robust_steps(*rows, T, scale_m=SCALE_M, reach_m=REACH_M, num_steps=num_steps))
+
+
+def surfaces_of(scan: PreparedScan, rows: slice = slice(None)) -> Surfaces:
+    """What a scan shows."""
+    found = scan.scan
+    return Surfaces(found.points[rows], found.normals[rows], found.features[rows], found.mask[rows])
+
+
+def compile_steps(params: Model) -> None:
+    """Compiles what `register` calls: shapes are fixed, so surfaces that show nothing do."""
+    nothing = inference.prepare(params, np.zeros((0, 3), np.float32))
+    few, many = (surfaces_of(nothing, slice(0, num)) for num in (NUM_LEARNED_POINTS, NUM_ROBUST_POINTS))
+    identity = np.eye(4, dtype=np.float32)
+    jax.block_until_ready(inference.fine_step(params, few, few, identity))
+    _robust(many, many, identity, STEPS_PER_ROUND)
+    rows = many.points, many.normals, many.mask, np.zeros(len(many.points), np.float32), many.points, many.normals
+    jax.block_until_ready(inference.sweep_steps(*rows, identity, np.zeros(6, np.float32), **SWEEP_OPTIONS))
+
+
 class MapTracker:
     """The local map of a drive, how well scans have fitted it lately, and what that says of the next one."""
 
-    def __init__(self, params: Model):
+    def __init__(self, params: Model, steps: Steps):
         if params.cfg.fine.num_iters == 0:
             raise ConfigError(
-                f"map: expected a network with a fine stage, got preset {params.cfg.name!r}, which has none; go without a map"
+                f"map: expected a network with a fine stage, got preset {params.cfg.name!r}, which has none; "
+                "go without a map: use_map=False, --map none"
             )
-        self._params, self._map = params, LocalMap()
+        self._params, self._steps, self._map = params, steps, LocalMap()
         self._scores: deque[float] = deque(maxlen=NUM_RECENT)
         self._inserted_at: np.ndarray | None = None
 
-    def restart(self, scan: EncodedScan, T_world_lidar: np.ndarray) -> None:
+    def restart(self, scan: PreparedScan, T_world_lidar: np.ndarray) -> None:
         """A new map that begins with this scan."""
         self._map, self._inserted_at = LocalMap(), None
         self._scores.clear()
         self.insert(scan, T_world_lidar)
 
-    def insert(self, scan: EncodedScan, T_world_lidar: np.ndarray) -> None:
+    def insert(self, scan: PreparedScan, T_world_lidar: np.ndarray) -> None:
         """Take in a scan, once a metre or so."""
         if self._inserted_at is not None:
             moved = se3.inverse(self._inserted_at) @ T_world_lidar
@@ -65,23 +198,39 @@ class MapTracker:
         self._map.prune(T_world_lidar)
         self._inserted_at = T_world_lidar
 
-    def locate(self, scan: EncodedScan, T_world_since: np.ndarray, T_since_guess: np.ndarray, *, recovering: bool = False) -> Estimate:
-        """Motion T_since_current of a scan, from a guess of it; the guess itself when the scan does not fit the map.
+    def locate(
+        self, scan: PreparedScan, T_world_since: np.ndarray, Ts_since_guess: Sequence[np.ndarray], elapsed_s: float, *, recovering: bool
+    ) -> Located:
+        """Motion T_since_current of a scan, from guesses of it; the first guess itself when the scan does not fit the map.
 
         Args:
             scan: the new scan.
             T_world_since: pose that the motion starts from.
-            T_since_guess: where to look.
-            recovering: the guess may be far off: more learned steps.
+            Ts_since_guess: where to look; the one that the scan fits best from stands.
+            elapsed_s: since then, for the velocity that the scan is de-skewed with again.
+            recovering: the guesses may be far off: more learned steps, from two subsets of the scan's points.
         """
+        num_learned = RECOVERY_STEPS if recovering and self._steps.num_learned else self._steps.num_learned
+        tries = []
+        for T_since_guess in Ts_since_guess:
+            near = Surroundings(self._map, T_world_since @ T_since_guess)
+            for skip in (0, NUM_LEARNED_POINTS) if recovering else (0,):
+                steps = {"num_learned": num_learned, "num_robust": self._steps.num_robust, "skip": skip}
+                tries.append((register(self._params, scan, near, np.eye(4), **steps), T_since_guess, near))
+        fix, T_since_guess, near = max(tries, key=lambda one: one[0].score)
+        if self._steps.num_passes > 1 and scan.times_s is not None and fix.score > 0.0:
+            scan, fix = register_sweep(scan, near, fix, se3.log(T_since_guess @ fix.T_start_lidar) / elapsed_s, self._steps.num_passes - 1)
+        return Located(self._judged(scan, fix, Ts_since_guess[0], T_since_guess), scan)
+
+    def _judged(self, scan: PreparedScan, fix: MapFix, T_expected: np.ndarray, T_since_guess: np.ndarray) -> Estimate:
+        """Motion, covariance and status of a fix."""
         cfg = self._params.cfg.status
-        fix = register(self._params, scan, self._map, T_world_since @ T_since_guess, num_learned=RECOVERY_STEPS if recovering else 2)
         usual = max(float(np.median(self._scores)) if self._scores else 0.0, MIN_USUAL_SCORE)
         confidence = float(np.clip(2.5 * fix.score / usual - 0.7, 0.0, 1.0))  # 0.8 at 0.6 of the usual score, 0.2 at 0.36
         seen = observability(fix.information)
         usable = (scan.num_points, max(len(self._map), cfg.min_points))
         health = status.judge(num_points=usable, finite=fix.score > 0.0, confidence=confidence, seen=seen, cfg=cfg)
-        T, known = T_since_guess, covariance.unknown(cfg)
+        T, known = T_expected, covariance.unknown(cfg)
         if health.status != "rejected":
             T = T_since_guess @ fix.T_start_lidar
             known = covariance.from_information(fix.information, sigma_m=SIGMA_M + fix.rms_m, num_planes=fix.score * NUM_INDEPENDENT)
@@ -89,42 +238,3 @@ class MapTracker:
         if health.status == "degenerate":
             known = covariance.widen(known, seen, cfg)
         return Estimate(T_target_source=T, **known._asdict(), status=health.status, confidence=health.confidence, reason=health.reason)
-
-
-def surfaces_of(scan: EncodedScan) -> Surfaces:
-    """What a scan shows."""
-    return Surfaces(*(np.asarray(array)[: scan.num_points] for array in scan.scan[:3]))
-
-
-def register(params: Model, scan: EncodedScan, local_map: LocalMap, T_world_start: np.ndarray, *, num_learned: int) -> MapFix:
-    """Pose of a scan on the map from a start; score 0 where there is no map.
-
-    The map is cropped in the frame of the start, so that its features are those that a sensor there would see. Neighbours are
-    found by a tree on the host between jitted steps: less than a millisecond a round, where XLA on a CPU needs several.
-    """
-    seen = local_map.crop(T_world_start, CROP_M)
-    if len(seen.points) < MIN_TARGETS:
-        return MapFix(np.eye(4), 0.0, np.inf, np.zeros((6, 6)))
-    tree = cKDTree(seen.points, balanced_tree=False, compact_nodes=False)
-    T = np.eye(4, dtype=np.float32)
-    source = jax.tree.map(lambda array: array[:NUM_LEARNED_POINTS], scan.encoding.cloud)
-    for _ in range(num_learned):
-        index = _nearest(tree, np.asarray(source.points), T)
-        T = np.asarray(inference.fine_step(params, source, *(array[index] for array in seen), T))
-    points, normals, mask = (np.asarray(array)[:NUM_ROBUST_POINTS] for array in (scan.scan.points, scan.scan.normals, scan.scan.mask))
-    for _ in range(NUM_ROBUST_ROUNDS):
-        index = _nearest(tree, points, T)
-        matched = seen.points[index], seen.normals[index]
-        fit = jax.device_get(
-            inference.robust_steps(points, normals, mask, *matched, T, scale_m=SCALE_M, reach_m=REACH_M, num_steps=STEPS_PER_ROUND)
-        )
-        T = fit.T_target_source
-    if not (np.isfinite(T).all() and np.isfinite(fit.information).all()):
-        return MapFix(np.eye(4), 0.0, np.inf, np.zeros((6, 6)))
-    T_start_lidar = se3.exp(se3.log(T.astype(np.float64)))  # orthonormal to float64
-    return MapFix(T_start_lidar, float(fit.score), float(fit.rms_m), np.asarray(fit.information, np.float64))
-
-
-def _nearest(tree: cKDTree, points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Row of the nearest target of each point."""
-    return tree.query(points @ T[:3, :3].T + T[:3, 3])[1]

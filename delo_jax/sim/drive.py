@@ -29,6 +29,8 @@ from delo_jax.sim.warp import Warp, max_curvature
 CLIP_START_M = 60.0
 REACH_M = 130.0
 """How far ahead and behind a long drive keeps its world."""
+DRIVE_SEED, LAST_DRIVE_SEED = 500_000, 999_999
+"""Of the first drive to test on, and of the last; training worlds and their validation use none from here to there."""
 
 
 def simulate_clip(

@@ -1,14 +1,22 @@
 """Training pairs from worlds: random frames of one world, augmented, with a start for the fine stage. Host code."""
 
+import jax
 import numpy as np
 
 from delo_jax.config import TrainConfig
 from delo_jax.geometry import se3
+from delo_jax.model.delo import Surfaces
+from delo_jax.pipeline.local_map import LocalMap
 from delo_jax.preprocess import Scan
 from delo_jax.train.step import PairBatch
 from delo_jax.train.worlds import World
 
 MAX_IDENTITY_START_M = 2.5  # farther than this the identity is no start for a local method
+MAP_FRAMES = 2, 5  # frames in a local map
+MAP_REACH_M = 60.0
+MAP_POSE_SIGMA = np.repeat([np.radians(0.05), 0.01], 3)  # of the frames in a map: an odometry is never exact
+WIDE_SHARE = 0.55  # of the predictions on a map, off by as much as after an outage; the others as in a stream
+WIDE_M, WIDE_DEG = 3.5, 17.0
 
 
 def _rotation_z(angle: float) -> np.ndarray:
@@ -56,6 +64,44 @@ def _start(T_true: np.ndarray, T_identity: np.ndarray, kind: int, rng: np.random
     return T_true @ se3.exp(xi)
 
 
+def _wrong_prediction(rng: np.random.Generator) -> np.ndarray:
+    """T_predicted_source of a scan that is not where it was expected."""
+    if rng.random() >= WIDE_SHARE:
+        return _start(np.eye(4), np.eye(4), 1, rng)
+    length, direction = WIDE_M * np.sqrt(rng.random()), rng.uniform(-np.pi, np.pi)
+    roll, pitch, z = rng.normal(size=3) * [np.radians(0.5), np.radians(0.5), 0.05]
+    yaw = np.radians(rng.uniform(-WIDE_DEG, WIDE_DEG))
+    return se3.exp(np.array([roll, pitch, yaw, length * np.cos(direction), length * np.sin(direction), z]))
+
+
+def _map_around(world: World, frame: int, T_predicted_source: np.ndarray, cfg: TrainConfig, rng: np.random.Generator) -> Surfaces:
+    """What a local map of other frames shows of the surroundings of a frame, in the frame where that one was expected."""
+    others = np.delete(np.arange(len(world.Ts_world_lidar)), frame)
+    num = min(int(rng.integers(MAP_FRAMES[0], MAP_FRAMES[1] + 1)), len(others))
+    local_map = LocalMap()
+    for other in np.sort(rng.permutation(others)[:num]):
+        local_map.insert(
+            _surfaces_of(Scan(*(array[other] for array in world.scans))),
+            world.Ts_world_lidar[other] @ se3.exp(MAP_POSE_SIGMA * rng.normal(size=6)),
+        )
+    seen = local_map.crop(world.Ts_world_lidar[frame] @ se3.inverse(T_predicted_source), MAP_REACH_M)
+    nearest = np.argsort(np.einsum("ij,ij->i", seen.points, seen.points), kind="stable")[: cfg.num_map_points]
+    return Surfaces(*(array[nearest] for array in seen))
+
+
+def _surfaces_of(scan: Scan) -> Surfaces:
+    """What a scan shows, its padding included."""
+    return Surfaces(scan.points, scan.normals, scan.features, scan.mask)
+
+
+def _padded(seen: Surfaces, num: int) -> Surfaces:
+    """As many rows as every pair has."""
+    arrays = [np.zeros((num, *array.shape[1:]), array.dtype) for array in seen]
+    for padded, array in zip(arrays, seen, strict=True):
+        padded[: len(array)] = array
+    return Surfaces(*arrays)
+
+
 def random_frames(num_frames: int, cfg: TrainConfig, rng: np.random.Generator) -> tuple[int, int]:
     """Frames of source and target, any two that are at most `max_gap` apart; the source is earlier unless pairs are augmented."""
     gaps = np.arange(1, min(cfg.max_gap, num_frames - 1) + 1)
@@ -80,12 +126,33 @@ def random_pair(world: World, cfg: TrainConfig, rng: np.random.Generator, *, evi
         scans = [_drawn(scan, cfg.model.preprocess.max_points, rng) for scan in scans]
     T = se3.inverse(world.Ts_world_lidar[frames[1]]) @ world.Ts_world_lidar[frames[0]]
     if not cfg.augment:
-        return PairBatch(scans[0], scans[1], T.astype(np.float32), np.eye(4, dtype=np.float32), np.array(True))
-    return _augmented(scans, T, rng, evidence=evidence)
+        return _with_surfaces(scans, T, np.eye(4), from_coarse=True, cfg=cfg, evidence=evidence)
+    on_map = cfg.fine_weight > 0 and not evidence and rng.random() < cfg.map_share
+    return _augmented(world, frames[0], scans, T, cfg, rng, on_map=on_map, evidence=evidence)
 
 
-def _augmented(scans: list[Scan], T: np.ndarray, rng: np.random.Generator, *, evidence: bool) -> PairBatch:
-    """The pair seen from turned, mirrored sensors, some points dropped, with a start for the fine stage."""
+def _with_surfaces(scans: list[Scan], T_true, T_init, *, from_coarse: bool, cfg: TrainConfig, evidence: bool) -> PairBatch:
+    """A pair whose fine stage, where it is trained, aligns the source with the target."""
+    used = cfg.fine_weight > 0 and not evidence
+    target = _surfaces_of(scans[1])
+    surfaces = _padded(target, cfg.num_map_points) if used else Surfaces(*(array[:0] for array in target))
+    T_true, T_init = T_true.astype(np.float32), T_init.astype(np.float32)
+    return PairBatch(scans[0], scans[1], T_true, T_init, np.array(from_coarse), surfaces, T_true, T_init)
+
+
+def _augmented(world, frame, scans, T, cfg: TrainConfig, rng: np.random.Generator, *, on_map: bool, evidence: bool) -> PairBatch:
+    """The pair seen from turned, mirrored sensors, some points dropped, with a start for the fine stage.
+
+    Args:
+        world: of the pair.
+        frame: of the source.
+        scans: source and target.
+        T: T_target_source.
+        cfg: of the training.
+        rng: randomness.
+        on_map: the fine stage gets a local map instead of the target, started where the source was expected.
+        evidence: see `random_pair`.
+    """
     mirror, drop = rng.random() < 0.5, rng.choice([0.0, 0.0, 0.3])
     if evidence and rng.random() < 0.2:
         drop = rng.uniform(0.5, 0.97)
@@ -96,8 +163,17 @@ def _augmented(scans: list[Scan], T: np.ndarray, rng: np.random.Generator, *, ev
     T_true = A_target @ (M @ T @ M) @ se3.inverse(A_source)
     T_identity = A_target @ se3.inverse(A_source)
     T_init = T_identity if evidence and rng.random() < 0.7 else _start(T_true, T_identity, int(rng.integers(2)), rng)
-    source, target = (_augment(scan, A, mirror, drop, rng) for scan, A in zip(scans, (A_source, A_target), strict=True))
-    return PairBatch(source, target, T_true.astype(np.float32), T_init.astype(np.float32), np.array(rng.random() < 1 / 3))
+    scans = [_augment(scan, A, mirror, drop, rng) for scan, A in zip(scans, (A_source, A_target), strict=True)]
+    pair = _with_surfaces(scans, T_true, T_init, from_coarse=rng.random() < 1 / 3, cfg=cfg, evidence=evidence)
+    if not on_map:
+        return pair
+    T_predicted_source = _wrong_prediction(rng)
+    seen = _map_around(world, frame, T_predicted_source, cfg, rng)
+    turned = A_source[:3, :3] @ M[:3, :3]
+    seen = seen._replace(points=(seen.points @ turned.T).astype(np.float32), normals=(seen.normals @ turned.T).astype(np.float32))
+    T_true = (A_source @ (M @ T_predicted_source @ M) @ se3.inverse(A_source)).astype(np.float32)
+    surfaces, start = _padded(seen, cfg.num_map_points), np.eye(4, dtype=np.float32)
+    return pair._replace(from_coarse=np.array(False), surfaces=surfaces, T_surfaces_source=T_true, T_surfaces_init=start)
 
 
 def unrelated_pair(first: World, second: World, cfg: TrainConfig, rng: np.random.Generator) -> PairBatch:
@@ -118,6 +194,4 @@ def make_batch(worlds: list[World], cfg: TrainConfig, rng: np.random.Generator, 
         first, second = (worlds[index] for index in rng.choice(len(worlds), size=2, p=lengths / lengths.sum()))
         wrong = evidence and first is not second and rng.random() < 0.125
         pairs.append(unrelated_pair(first, second, cfg, rng) if wrong else random_pair(first, cfg, rng, evidence=evidence))
-    sources, targets, *rest = zip(*pairs, strict=True)
-    stack = [Scan(*(np.stack(arrays) for arrays in zip(*scans, strict=True))) for scans in (sources, targets)]
-    return PairBatch(*stack, *(np.stack(arrays) for arrays in rest))
+    return jax.tree.map(lambda *arrays: np.stack(arrays), *pairs)

@@ -29,6 +29,11 @@ class PairBatch(NamedTuple):
     T_target_source: Float[Array, "b 4 4"]  # truth
     T_init: Float[Array, "b 4 4"]  # start of the fine stage
     from_coarse: Bool[Array, " b"]  # start from the coarse stage's own output instead
+    surfaces: (
+        delo.Surfaces
+    )  # target of the fine stage: the target scan, or a local map around it; without rows where there is no fine stage
+    T_surfaces_source: Float[Array, "b 4 4"]  # truth
+    T_surfaces_init: Float[Array, "b 4 4"]  # start of the fine stage there
 
 
 class TrainState(NamedTuple):
@@ -91,10 +96,10 @@ def pair_loss(model: delo.Applicable, pair: PairBatch, cfg: TrainConfig, frozen:
         terms["aux"] = losses.auxiliary_loss(matched, sent, T_true, points)
         weights |= {"pose": cfg.odometry_weight, "aux": cfg.odometry_weight * cfg.aux_weight}
     if cfg.fine_weight > 0:
-        begin = jnp.where(pair.from_coarse, jax.lax.stop_gradient(first.T_target_source), pair.T_init)
+        begin = jnp.where(pair.from_coarse, jax.lax.stop_gradient(first.T_target_source), pair.T_surfaces_init)
         points = jax.tree.map(lambda array: array[: cfg.num_points], source.cloud)
-        poses = delo.refine_pose(solver, points, target.cloud, begin, num_iters=cfg.num_iters)
-        weights["fine"], terms["fine"] = cfg.fine_weight, losses.pose_loss(poses, T_true)
+        poses = delo.refine_pose(solver, points, delo.cloud_of(solver, pair.surfaces), begin, num_iters=cfg.num_iters)
+        weights["fine"], terms["fine"] = cfg.fine_weight, losses.pose_loss(poses, pair.T_surfaces_source)
     if cfg.evidence_weight > 0:
         weights["evidence"] = cfg.evidence_weight
         if cfg.model.evidence.head == "embedding":

@@ -12,13 +12,17 @@ from typing import NamedTuple
 import numpy as np
 
 from delo_jax.config import PreprocessConfig, TrainConfig
-from delo_jax.preprocess import Scan, preprocess
-from delo_jax.sim import KINDS, simulate_clip
+from delo_jax.data.fields import FRAME_PERIOD_NS
+from delo_jax.geometry import se3
+from delo_jax.preprocess import Scan, preprocess, preprocess_timed, still
+from delo_jax.sim import KINDS, SimulatedScan, simulate_clip
 
-SIMULATOR = 1  # counts the changes of `delo_jax.sim` that change a world; stored worlds of another are not used
+SIMULATOR = 2  # counts the changes of `delo_jax.sim` and here that change a world; stored worlds of another are not used
 VALIDATION_SEED = 1_000_000  # of the first held-out world
 SEEDS_PER_RUN = 2_000_000  # so that runs of different seeds share no world
 RAW_RESERVE = 4  # raw scans keep so many times the points of one input, of which training draws anew each time
+AS_MEASURED_SHARE = 1 / 3  # of the worlds: their scans are not de-skewed, as those of a single pair
+VELOCITY_SIGMA = np.repeat([np.radians(2.0), 0.2], 3)  # of the velocity that the others are de-skewed with, per second
 SENSORS = ("hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl64e", "hdl32e", "os1-128")
 
 
@@ -58,10 +62,27 @@ def make_world(index: int, *, seed: int, num_frames: int, cfg: PreprocessConfig)
     kind = KINDS[index % len(KINDS)]
     sensor = SENSORS[(index // len(KINDS)) % len(SENSORS)]
     clip = simulate_clip(kind, seed + index, num_frames=num_frames, sensor=sensor)
+    Ts_world_lidar = np.stack([scan.T_world_lidar for scan in clip])
+    velocities = _velocities(Ts_world_lidar, np.random.default_rng([seed + index, 61]))
     with ThreadPoolExecutor(2) as pool:
-        scans = list(pool.map(lambda scan: preprocess(scan.points, stored_config(cfg)), clip))
-    stacked = Scan(*(np.stack(arrays) for arrays in zip(*scans, strict=True)))
-    return World(stacked, np.stack([scan.T_world_lidar for scan in clip]))
+        scans = list(pool.map(lambda scan, velocity: _world_scan(scan, velocity, stored_config(cfg)), clip, velocities))
+    return World(Scan(*(np.stack(arrays) for arrays in zip(*scans, strict=True))), Ts_world_lidar)
+
+
+def _velocities(Ts_world_lidar: np.ndarray, rng: np.random.Generator) -> list[np.ndarray | None]:
+    """What an odometry would de-skew each scan with: its last motion, a little off; None in worlds that stay as measured."""
+    if rng.random() < AS_MEASURED_SHARE:
+        return [None] * len(Ts_world_lidar)
+    motions = se3.log(se3.inverse(Ts_world_lidar[:-1]) @ Ts_world_lidar[1:]) / (1e-9 * FRAME_PERIOD_NS)
+    return list(motions[[0, *range(len(motions))]] + VELOCITY_SIGMA * rng.normal(size=(len(Ts_world_lidar), 6)))
+
+
+def _world_scan(scan: SimulatedScan, velocity: np.ndarray | None, cfg: PreprocessConfig) -> Scan:
+    """A simulated scan preprocessed and, with a velocity, de-skewed."""
+    if velocity is None or not np.any(scan.times_s):
+        return preprocess(scan.points, cfg)
+    prepared, times_s = preprocess_timed(scan.points, scan.times_s, cfg)
+    return prepared if times_s is None else still(prepared, times_s, velocity)
 
 
 def worlds(cfg: TrainConfig, folder: Path, *, validation: bool, on_world: Callable[[], None] = lambda: None) -> Iterator[World]:

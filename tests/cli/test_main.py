@@ -50,7 +50,7 @@ def test_choices_are_those_of_the_simulator():
 def test_options_in_toml(cli):
     """Oracle: the standard library's TOML parser; a path may hold quotes, backslashes and line breaks."""
     done = cli("run", 'a "b"\\c\nd', "--deskew", "off", "--dump-config", "--weights", "w")
-    expected = {"path": 'a "b"\\c\nd', "weights": "w", "map": "none", "deskew": "off", "no_elevation_correction": False}
+    expected = {"path": 'a "b"\\c\nd', "weights": "w", "map": "local", "deskew": "off", "no_elevation_correction": False}
     assert tomllib.loads(done.out) == expected
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from delo_jax.data.sequence import Dataset
 
-NUM_SCANS, NAME = 8, "mixed-1"  # of the tree
+NUM_SCANS, NAME = 8, "mixed-50"  # of the tree
 CALIBRATION = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]])  # that the tree is written with
 
 

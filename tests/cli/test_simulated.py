@@ -11,6 +11,8 @@ import pytest
 from delo_jax import sim, weights
 from delo_jax.cli import doctor
 from delo_jax.data import open_dataset
+from delo_jax.data.fields import FRAME_PERIOD_NS
+from delo_jax.sim.drive import DRIVE_SEED
 from delo_jax.train.validate import GapErrors
 
 WITHOUT_SOCKETS = """
@@ -58,28 +60,40 @@ def test_demo_spares_another_run(cli, tmp_path):
 def test_simulated_tree_is_read_back(tree):
     """Oracle: the simulator, called by hand with the same arguments; files hold float32 and 13 digits."""
     dataset = open_dataset(tree)
-    drive = list(sim.simulate_drive("mixed", 1, len(dataset)))
+    drive = list(sim.simulate_drive("mixed", DRIVE_SEED + int(dataset.name.removeprefix("mixed-")), len(dataset)))
     assert dataset.compensated is True
     assert dataset.elevation_correction_deg == 0.0
     np.testing.assert_array_equal(dataset[2].points, drive[2].points)
     T_first_last = np.linalg.inv(drive[0].T_world_lidar) @ drive[-1].T_world_lidar
     np.testing.assert_allclose(dataset.truth[-1], T_first_last, atol=1e-9)
+    np.testing.assert_array_equal(dataset.stamps_ns, FRAME_PERIOD_NS * np.arange(len(dataset)))
 
 
 def test_simulate_rolling_shutter_and_refuses_to_overwrite(cli, tmp_path):
     """Oracle: the command that it prints, given to the parser, and the scans of the first call."""
-    done = cli("simulate", tmp_path, "--num-scans", "2", "--seed", "5", "--rolling-shutter")
+    done = cli("simulate", tmp_path, "--drive", "residential", "--num-scans", "2", "--seed", "5", "--rolling-shutter")
     assert done.code == 0
+    assert "exact, in poses/residential-5.txt" in done.out
+    assert len((tmp_path / "poses" / "residential-5.txt").read_text().splitlines()) == 2
     command = re.search(r"delo (run .*)", done.out)[1].split()
-    assert command == ["run", str(tmp_path), "--sequence", "mixed-5"]
+    assert command == ["run", str(tmp_path), "--sequence", "residential-5"]
     assert cli(*command, "--dump-config").code == 0
     dataset = open_dataset(tmp_path)
     assert (dataset.compensated, dataset.point_times) == (False, "azimuth")
-    drive = next(iter(sim.simulate_drive("mixed", 5, 2, rolling_shutter=True)))
+    drive = next(iter(sim.simulate_drive("residential", DRIVE_SEED + 5, 2, rolling_shutter=True)))
     late_s = (dataset[0].times - drive.times_s + 0.05) % 0.1 - 0.05  # right behind, a sweep begins and ends
     np.testing.assert_allclose(late_s, 0.0, atol=1e-3)  # a column of beams is wider than a line
-    again = cli("simulate", tmp_path, "--num-scans", "2", "--seed", "5")
+    again = cli("simulate", tmp_path, "--drive", "residential", "--num-scans", "2", "--seed", "5")
     assert (again.code, again.err.count("\n")) == (2, 1)
+
+
+@pytest.mark.parametrize("seed", [-1, 500_000, 1_000_000])
+def test_simulate_keeps_to_its_own_seeds(seed, cli, tmp_path):
+    """Oracle: the sentence; nothing is written."""
+    done = cli("simulate", tmp_path / "out", f"--seed={seed}")
+    assert (done.code, done.out) == (2, "")
+    assert done.err == f"delo: seed: expected 0 to 499999, whose worlds training never uses, got {seed}\n"
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("bound_cm", "state"), [(50.0, "ok"), (0.0, "problem")])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from delo_jax.geometry.point_to_plane import point_to_plane_step, robust_point_to_plane
+from delo_jax.geometry.point_to_plane import point_to_plane_step, robust_point_to_plane, robust_sweep_to_plane
 from tests.oracles.agreement import assert_gradient_is_the_slope, assert_transforms_agree
 from tests.oracles.registration import hat, numeric_jacobian, point_to_plane_minimum, point_to_plane_residuals
 
@@ -180,5 +180,89 @@ def test_robust_fit_without_a_match():
     points, source_normals, mask, targets, normals, _ = outlier_problem(0, n=50)
     found = robust(*as_float32([points, source_normals, mask, targets + 100.0, normals, np.eye(4)]), num_steps=2)
     np.testing.assert_allclose(found.T_target_source, np.eye(4), atol=1e-6)
+    assert float(found.score) < 1e-6
+    assert all(np.isfinite(array).all() for array in found)
+
+
+SWEEP_OPTIONS = {"scale_m": 0.5, "reach_m": 5.0, "sigma_velocity": (0.5, 2.0), "sigma_m": 1e-3}
+sweep = functools.partial(
+    jax.jit(robust_sweep_to_plane, static_argnames=("scale_m", "reach_m", "num_steps", "sigma_velocity", "sigma_m")), **SWEEP_OPTIONS
+)
+
+
+def moving_sweep(seed, velocity, normals=None, n=600):
+    """Points on planes around a sensor that moves, each in its frame at its own time; the pose at the stamp is the identity."""
+    rng = np.random.default_rng(seed)
+    targets = 20 * rng.uniform(-1, 1, (n, 3))
+    if normals is None:
+        normals = rng.normal(size=(n, 3))
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    times = -np.arctan2(targets[:, 1], targets[:, 0]) / (2 * np.pi) * 0.1
+    Ts = expm(np.array([hat(-t * velocity) for t in times]))  # from the frame at the stamp to that at t
+    points = np.einsum("nij,nj->ni", Ts[:, :3, :3], targets) + Ts[:, :3, 3]
+    return points, normals, np.ones(n, bool), times, targets, normals
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sweep_fit_finds_pose_and_velocity(seed):
+    """Oracle: closed form; the sensor turns at 20 deg/s and drives 3 m/s, its pose is 10 cm and 0.6 deg off at the start."""
+    velocity = np.array([0.1, -0.2, 0.35, 3.0, 0.4, -0.2])
+    data = as_float32(moving_sweep(seed, velocity))
+    start = expm(hat([0.006, -0.004, 0.008, 0.06, -0.05, 0.06]))
+    found = sweep(*data, *as_float32([start, np.zeros(6)]), num_steps=12)
+    np.testing.assert_allclose(found.velocity, velocity, atol=0.03)  # first order: 0.35 rad/s * 3 m/s * 0.05 s / 2
+    np.testing.assert_allclose(found.T_target_source, np.eye(4), atol=2e-3)
+    assert float(found.rms_m) < 5e-3
+    assert float(found.score) > 0.99
+
+
+def test_velocity_that_no_plane_holds_is_the_expected_one():
+    """Oracle: the prior; in a corridor nothing moves when the sensor does, along it."""
+    rng = np.random.default_rng(0)
+    normals = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])[rng.integers(0, 2, 600)]
+    data = as_float32(moving_sweep(1, np.array([0.0, 0.0, 0.2, 5.0, 0.0, 0.0]), normals))
+    expected = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 0.0])
+    found = sweep(*data, *as_float32([np.eye(4), expected]), num_steps=8)
+    assert float(found.velocity[3]) == pytest.approx(4.0, abs=0.1)
+    assert float(found.velocity[2]) == pytest.approx(0.2, abs=0.02)
+
+
+def test_sweep_of_one_instant_is_a_scan():
+    """Oracle: the robust fit of a pose alone; all points measured at the stamp."""
+    points, source_normals, mask, targets, normals, _ = outlier_problem(0)
+    still = sweep(
+        *as_float32([points, source_normals, mask, np.zeros(len(points)), targets, normals, np.eye(4), np.zeros(6)]), num_steps=20
+    )
+    pose = robust(*as_float32([points, source_normals, mask, targets, normals, np.eye(4)]), scale_m=0.5, num_steps=20)
+    np.testing.assert_allclose(still.T_target_source, pose.T_target_source, atol=2e-4)
+    np.testing.assert_allclose(still.velocity, np.zeros(6), atol=1e-6)
+    np.testing.assert_allclose(float(still.score), float(pose.score), atol=1e-4)
+    scale = np.sqrt(np.outer(np.diag(pose.information), np.diag(pose.information)))
+    np.testing.assert_allclose(still.information / scale, pose.information / scale, atol=1e-3)
+
+
+def test_sweep_information_has_the_velocity_free():
+    """Oracle: central differences of the plane distances in float64, and the pose's block of the inverse of the whole matrix."""
+    velocity = np.array([0.05, -0.1, 0.2, 2.0, 0.3, -0.1])
+    points, source_normals, mask, times, targets, normals = moving_sweep(2, velocity)
+    found = sweep(*as_float32([points, source_normals, mask, times, targets, normals, np.eye(4), velocity]), num_steps=8)
+
+    def distances(x):
+        Ts = np.array([expm(hat(x[:6])) @ expm(hat(t * (velocity + x[6:]))) for t in times])
+        return np.sum((np.einsum("nij,nj->ni", Ts[:, :3, :3], points) + Ts[:, :3, 3] - targets) * normals, axis=1)
+
+    J = numeric_jacobian(distances, np.zeros(12))
+    prior = np.repeat([(1e-3 / 0.5) ** 2, (1e-3 / 2.0) ** 2], 3)
+    whole = J.T @ J / len(points) + np.diag(np.r_[np.zeros(6), prior])
+    expected = np.linalg.inv(np.linalg.inv(whole)[:6, :6])
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found.information / scale, expected / scale, atol=0.02)
+
+
+def test_sweep_fit_without_a_match():
+    """Oracle: the start, and a score of zero; nothing that is not finite."""
+    points, source_normals, mask, times, targets, normals = as_float32(moving_sweep(0, np.zeros(6), n=50))
+    found = sweep(points, source_normals, mask, times, targets + 100.0, normals, *as_float32([np.eye(4), np.zeros(6)]), num_steps=2)
+    np.testing.assert_allclose(found.T_target_source, np.eye(4), atol=1e-5)
     assert float(found.score) < 1e-6
     assert all(np.isfinite(array).all() for array in found)

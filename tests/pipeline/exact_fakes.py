@@ -1,11 +1,13 @@
 """A network that is never wrong: scans that carry their own correspondences, aligned in closed form."""
 
+import dataclasses
+
 import numpy as np
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from delo_jax.config import DeloConfig, StatusConfig
-from delo_jax.inference import EncodedScan, Estimate
+from delo_jax.inference import Estimate
 from delo_jax.model.delo import Model
 from delo_jax.pipeline.lidar_odometry import LidarOdometry
 from tests.oracles.registration import hat
@@ -39,6 +41,26 @@ def kabsch(source, target):
     return T
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExactScan:
+    """Landmarks as prepared; de-skewed by scipy's expm."""
+
+    points: np.ndarray
+    measured: np.ndarray
+    times_s: np.ndarray | None = None
+
+    @property
+    def num_points(self):
+        return len(self.points)
+
+    def still(self, velocity):
+        if self.times_s is None or velocity is None:
+            return self
+        Ts = expm(np.array([hat(t * velocity) for t in self.times_s]))
+        points = np.einsum("nij,nj->ni", Ts[:, :3, :3], self.measured) + Ts[:, :3, 3]
+        return dataclasses.replace(self, points=points.astype(np.float32))
+
+
 class ExactNetwork:
     """`prepare` and `align` for LidarOdometry; remembers what it was asked.
 
@@ -49,10 +71,10 @@ class ExactNetwork:
         self.prepared, self.starts, self.pairs = [], [], []
         self._reach_m, self._copy = reach_m, copy
 
-    def prepare(self, params, points):
-        points = points.copy() if self._copy else points
+    def prepare(self, params, points, times_s):
+        points, times_s = (None if array is None else array.copy() if self._copy else array for array in (points, times_s))
         self.prepared.append(points)
-        return EncodedScan(points, len(points), points)
+        return ExactScan(points, points, times_s)
 
     def _fits(self, T, source, target):
         apart = np.abs(source @ T[:3, :3].T + T[:3, 3] - target).max()
@@ -60,10 +82,10 @@ class ExactNetwork:
 
     def align(self, params, source, target, T_target_source_init):
         self.starts.append(T_target_source_init)
-        self.pairs.append((source.encoding, target.encoding))
+        self.pairs.append((source.points, target.points))
         bad = min(source.num_points, target.num_points) < params.cfg.status.min_points
-        T = T_target_source_init if bad else kabsch(source.encoding, target.encoding)
-        if not bad and not self._fits(T, source.encoding, target.encoding):
+        T = T_target_source_init if bad else kabsch(source.points, target.points)
+        if not bad and not self._fits(T, source.points, target.points):
             bad, T = True, T_target_source_init
         variances = UNKNOWN if bad else SIGMA2
         return Estimate(
@@ -80,7 +102,7 @@ class ExactNetwork:
 def make(network=None, **options):
     """An odometry and its network."""
     network = ExactNetwork() if network is None else network
-    return LidarOdometry(PARAMS, prepare=network.prepare, align=network.align, **options), network
+    return LidarOdometry(PARAMS, use_map=False, prepare=network.prepare, align=network.align, **options), network
 
 
 def winding_road(num):

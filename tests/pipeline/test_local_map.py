@@ -5,11 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from delo_jax.config import PreprocessConfig
-from delo_jax.pipeline.local_map import LocalMap, Surfaces
+from delo_jax.model.delo import Surfaces
+from delo_jax.pipeline.local_map import LocalMap
 from delo_jax.preprocess import NUM_FEATURES, preprocess
 from tests.oracles import street
 
-MAX_COUNT = 3
+MAX_COUNT, PADDING = 3, 7
 
 
 def observed(seed, num=400):
@@ -22,13 +23,14 @@ def observed(seed, num=400):
     T[:3, 3] = rng.uniform(-1, 1, 3)
     points = rng.uniform(-4, 4, (num, 3))
     features = rng.normal(size=(num, NUM_FEATURES))
-    return Surfaces(*(array.astype(np.float32) for array in (points, normals, features))), T
+    mask = np.arange(num) < num - PADDING
+    return Surfaces(points.astype(np.float32), normals.astype(np.float32), features.astype(np.float32), mask), T
 
 
 def insert(voxels, seen, T):
     """The specification: the nearest of a scan's points in a voxel; mean where normals agree, replaced from much nearer."""
     nearest: dict[tuple, tuple] = {}
-    for point, normal, features in zip(*(array.astype(np.float64) for array in seen), strict=True):
+    for point, normal, features in zip(*(array[seen.mask].astype(np.float64) for array in seen[:3]), strict=True):
         world = T[:3, :3] @ point + T[:3, 3]
         key, distance = tuple(np.floor(world).astype(int)), np.linalg.norm(point)
         if key not in nearest or distance < nearest[key][3]:
@@ -92,7 +94,7 @@ def test_a_scan_comes_back_as_its_sensor_saw_it():
     scan = preprocess(street.scan(T).points, PreprocessConfig())
     num = int(scan.mask.sum())
     local_map = LocalMap(voxel_m=0.01)
-    local_map.insert(Surfaces(scan.points[:num], scan.normals[:num], scan.features[:num]), T)
+    local_map.insert(Surfaces(scan.points, scan.normals, scan.features, scan.mask), T)
     found = local_map.crop(T, 100.0)
     ours, theirs = np.lexsort(found.points.round(2).T), np.lexsort(scan.points[:num].round(2).T)
     assert len(found.points) == num
@@ -122,7 +124,7 @@ def test_nothing_seen():
     """Oracle: by hand."""
     local_map, nothing = (
         LocalMap(),
-        Surfaces(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, NUM_FEATURES), np.float32)),
+        Surfaces(np.zeros((5, 3), np.float32), np.zeros((5, 3), np.float32), np.zeros((5, NUM_FEATURES), np.float32), np.zeros(5, bool)),
     )
     assert len(local_map.crop(np.eye(4), 10.0).points) == len(local_map) == 0
     local_map.insert(nothing, np.eye(4))

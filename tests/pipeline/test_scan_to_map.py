@@ -12,7 +12,7 @@ from delo_jax import inference
 from delo_jax.errors import ConfigError
 from delo_jax.pipeline.lidar_odometry import LidarOdometry
 from delo_jax.pipeline.local_map import LocalMap
-from delo_jax.pipeline.scan_to_map import MapTracker, register, surfaces_of
+from delo_jax.pipeline.scan_to_map import MapTracker, Steps, Surroundings, register, surfaces_of
 from tests.fixtures import errors, narrow_model
 from tests.oracles import street
 from tests.oracles.registration import hat
@@ -45,6 +45,12 @@ def street_map(num):
     return local_map
 
 
+def fixed(local_map, start, num_learned):
+    """The sixth scan registered from a start."""
+    near = Surroundings(local_map, start)
+    return register(weights(), prepared(5), near, np.eye(4), num_learned=num_learned, num_robust=4)
+
+
 @pytest.mark.parametrize(("size", "num_learned"), [(0.1, 2), (1.0, 6)])
 def test_scan_is_registered_to_the_map(size, num_learned):
     """Oracle: the pose that the scan was taken from; 1 cm of range noise, a start off by up to 1 m and 3 deg."""
@@ -52,7 +58,7 @@ def test_scan_is_registered_to_the_map(size, num_learned):
     for _ in range(3):
         xi = size * rng.choice([-1, 1], 6) * np.repeat([np.radians(3.0) / np.sqrt(3), 1.0 / np.sqrt(3)], 3)
         start = pose_at(5) @ expm(hat(xi))
-        fix = register(weights(), prepared(5), local_map, start, num_learned=num_learned)
+        fix = fixed(local_map, start, num_learned)
         translation_m, rotation_deg = errors(start @ fix.T_start_lidar, pose_at(5))
         assert translation_m < 0.04
         assert rotation_deg < 0.15
@@ -63,16 +69,16 @@ def test_scan_is_registered_to_the_map(size, num_learned):
 def test_wrong_place_scores_low():
     """Oracle: the same scan at its true place; 6 m aside nothing fits."""
     local_map = street_map(4)
-    right = register(weights(), prepared(5), local_map, pose_at(5), num_learned=0)
+    right = fixed(local_map, pose_at(5), 0)
     aside = pose_at(5) @ street.pose(0.0, 6.0, 0.0, yaw_deg=40.0)
-    wrong = register(weights(), prepared(5), local_map, aside, num_learned=0)
+    wrong = fixed(local_map, aside, 0)
     assert wrong.score < 0.6 * right.score
 
 
 def test_no_map_no_pose():
     """Oracle: by hand: the guess stands, and the status says so."""
-    tracker, guess = MapTracker(weights()), street.pose(1.0)
-    estimate = tracker.locate(prepared(0), np.eye(4), guess)
+    tracker, guess = MapTracker(weights(), Steps()), street.pose(1.0)
+    estimate = tracker.locate(prepared(0), np.eye(4), [guess], 0.1, recovering=False).motion
     assert estimate.status == "rejected"
     np.testing.assert_array_equal(estimate.T_target_source, guess)
 
@@ -80,12 +86,12 @@ def test_no_map_no_pose():
 def test_map_needs_normals():
     """Oracle: the sentence: the paper's presets have raw points."""
     with pytest.raises(ConfigError, match="expected a network with a fine stage"):
-        LidarOdometry(narrow_model("paper"), use_map=True)
+        LidarOdometry(narrow_model("paper"))
 
 
 def drive(scans, **options):
     """Frames of an odometry on the map."""
-    odometry = LidarOdometry(weights(), use_map=True, **options)
+    odometry = LidarOdometry(weights(), **options)
     return [odometry.register(points) for points in scans]
 
 
@@ -143,3 +149,55 @@ def test_information_becomes_a_covariance():
     np.testing.assert_allclose(found.aleatoric, np.diag(found.covariance))
     assert not found.epistemic.any()
     assert np.isfinite(from_information(np.zeros((6, 6)), sigma_m=0.05, num_planes=0.0).covariance).all()
+
+
+def body_pose(time_s):
+    """A sensor that drives 12 m/s and nods and sways at 1.5 Hz, as no constant velocity says."""
+    nod, sway = 0.8 * np.sin(2 * np.pi * 1.5 * time_s), 0.6 * np.cos(2 * np.pi * 1.5 * time_s)
+    return street.pose(12.0 * time_s - 8.0, 0.05, 1.7, yaw_deg=2.0 * sway, pitch_deg=nod, roll_deg=sway)
+
+
+def rolling_sweep(k, num_groups=24):
+    """A scan as measured by the moving sensor: groups of azimuths, each from where the sensor was; and the times of its points."""
+    edges = np.linspace(-np.pi, np.pi, num_groups + 1)
+    points, times = [], []
+    for index in range(num_groups):
+        time_s = -0.05 * (edges[index] + edges[index + 1]) / (2 * np.pi)
+        seen = street.scan(body_pose(0.1 * k + time_s), noise_m=0.01, seed=1000 * k + index).points
+        azimuth = np.arctan2(seen[:, 1], seen[:, 0])
+        here = seen[(azimuth >= edges[index]) & (azimuth < edges[index + 1])]
+        points.append(here)
+        times.append(np.full(len(here), time_s))
+    return np.concatenate(points), np.concatenate(times)
+
+
+def test_velocity_within_a_sweep_is_found():
+    """Oracle: the poses at the stamps; a body that nods is followed twice as well when the sweep's own velocity is solved for."""
+    sweeps, truth = [rolling_sweep(k) for k in range(7)], [body_pose(0.1 * k) for k in range(7)]
+    rotation_deg = {}
+    for num_passes in (1, 2):
+        odometry = LidarOdometry(weights(), steps=Steps(num_passes=num_passes))
+        frames = [odometry.register(points, times_s=times) for points, times in sweeps]
+        assert {frame.status for frame in frames} == {"ok"}
+        found = [errors(frame.motion.T_target_source, np.linalg.inv(truth[k]) @ truth[k + 1]) for k, frame in enumerate(frames[1:])]
+        rotation_deg[num_passes] = np.mean([deg for _, deg in found[2:]])
+    assert rotation_deg[2] < 0.5 * rotation_deg[1]
+
+
+def test_a_scan_that_comes_twice_does_not_mislead_the_next():
+    """Oracle: the truth; the second copy says that the sensor stands still, and the next scan is 2.4 m on."""
+    frames = drive([sweep(k) for k in (0, 1, 2, 3, 3, 5, 6)])
+    assert frames[4].status == "ok"
+    for frame, k in zip(frames[5:], (5, 6), strict=True):
+        assert errors(frame.T_world_lidar, np.linalg.inv(pose_at(0)) @ pose_at(k))[0] < 0.1
+
+
+def test_map_begins_anew_elsewhere():
+    """Oracle: the motion between the two last scans; the sensor wakes up in another street, where the map fits nothing."""
+    boxes = np.array([[x, y, 1.0, 1.5, 3.0, 7.0 * x] for x in range(-30, 50, 7) for y in (-7.0, 8.0, 15.0)])
+    there = [street.scan(pose_at(k), boxes=boxes, noise_m=0.01, seed=k).points for k in (20, 21, 22, 23)]
+    frames = drive([sweep(k) for k in (0, 1, 2)] + there)
+    assert [frame.status for frame in frames[-2:]] == ["ok", "ok"]
+    for k in (22, 23):
+        found = np.linalg.inv(frames[k - 18].T_world_lidar) @ frames[k - 17].T_world_lidar
+        assert errors(found, np.linalg.inv(pose_at(k - 1)) @ pose_at(k))[0] < 0.1

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 from collections import Counter
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -120,6 +121,59 @@ def test_a_third_starts_from_the_coarse_stage():
     assert abs(np.mean(draws) - 1 / 3) < 5 * np.sqrt(2 / 9 / 90)
 
 
+def on_a_map(name, seed):
+    """A pair whose fine stage gets a local map."""
+    cfg = dataclasses.replace(TRAINING, map_share=1.0)
+    return random_pair(world(name), cfg, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(("name", "median_m", "share"), [("street", 0.02, 0.7), ("simulated", 0.06, 0.5)])
+def test_truth_lays_the_source_on_the_surfaces_of_a_map(name, median_m, share):
+    """Oracle: simulator truth, as for pairs; frames of the map are a centimetre off. The start is where the source was expected."""
+    apart = []
+    for seed in range(12):
+        pair = on_a_map(name, seed)
+        assert_rigid(pair.T_surfaces_source)
+        errors, agreement = plane_errors(pair._replace(target=pair.surfaces), pair.T_surfaces_source)
+        assert np.median(errors) < median_m
+        assert agreement > share
+        np.testing.assert_array_equal(pair.T_surfaces_init, np.eye(4))
+        assert not pair.from_coarse
+        apart.append(np.linalg.norm(pair.T_surfaces_source[:3, 3]))
+    assert min(apart) < 0.5 < 1.5 < max(apart) < 5.0
+
+
+def test_map_shows_what_a_sensor_there_would_see():
+    """Oracle: the form of a scan; range, height and steepness by hand; more surfaces than one scan has."""
+    larger = 0
+    for seed in range(8):
+        pair = on_a_map("street", seed)
+        near = pair.surfaces
+        count = int(near.mask.sum())
+        np.testing.assert_array_equal(near.mask, np.arange(TRAINING.num_map_points) < count)
+        points, normals = near.points[:count], near.normals[:count]
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-4)
+        assert np.all(np.sum(points * normals, axis=1) < 1e-2)
+        np.testing.assert_allclose(near.features[:count, 5], np.log(np.linalg.norm(points, axis=1)) - 2.7, atol=1e-3)
+        np.testing.assert_allclose(near.features[:count, 6], points[:, 2] / 3.0, atol=1e-3)
+        np.testing.assert_allclose(near.features[:count, 7], np.abs(normals[:, 2]), atol=1e-3)
+        assert not near.points[count:].any()
+        larger += count > pair.source.mask.sum()
+    assert larger > 0
+
+
+def test_share_of_pairs_on_a_map():
+    """Oracle: the config; without a map the fine stage gets the target, and where it is not trained nothing."""
+    cfg = dataclasses.replace(TRAINING, map_share=0.0)
+    pair = random_pair(world("street"), cfg, np.random.default_rng(0))
+    np.testing.assert_array_equal(pair.surfaces.points[: len(pair.target.points)], pair.target.points)
+    np.testing.assert_array_equal(pair.T_surfaces_source, pair.T_target_source)
+    np.testing.assert_array_equal(pair.T_surfaces_init, pair.T_init)
+    draws = [np.array_equal(random_pair(world("street"), TRAINING, np.random.default_rng(k)).T_surfaces_init, np.eye(4)) for k in range(80)]
+    assert abs(np.mean(draws) - TRAINING.map_share) < 5 * np.sqrt(0.25 / 80)
+    assert len(random_pair(world("street"), TRAINING, np.random.default_rng(0), evidence=True).surfaces.points) == 0
+
+
 @pytest.mark.parametrize("evidence", [False, True])
 def test_same_generator_same_batch(evidence):
     """Oracle: repetition; another seed gives another batch."""
@@ -127,7 +181,7 @@ def test_same_generator_same_batch(evidence):
 
     def batch(seed):
         pairs = make_batch(worlds, dataclasses.replace(TINY_TRAINING, batch_size=3), np.random.default_rng((0, seed)), evidence=evidence)
-        arrays = [*pairs.source, *pairs.target, *pairs[2:]]
+        arrays = jax.tree.leaves(pairs)
         assert {len(array) for array in arrays} == {3}
         assert pairs.T_target_source.dtype == pairs.T_init.dtype == np.float32
         return b"".join(array.tobytes() for array in arrays)

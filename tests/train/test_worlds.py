@@ -1,20 +1,27 @@
 """Worlds on disk: made once, told apart by what they were made from."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from delo_jax.config import PreprocessConfig
 from delo_jax.preprocess import preprocess
-from delo_jax.sim import KINDS
+from delo_jax.sim import KINDS, SimulatedScan
 from delo_jax.train import worlds as module
 from delo_jax.train.worlds import worlds
 from tests.fixtures import TINY_TRAINING
 from tests.oracles import street
 
 CFG = dataclasses.replace(TINY_TRAINING, num_scenes=7, num_validation_scenes=2, num_frames=2)
+
+
+def sweep(T_world_lidar, times_s=0.0):
+    """A scan of the street as the simulator delivers it."""
+    points = street.scan(T_world_lidar, num_rings=8, num_columns=180).points
+    num = len(points)
+    ids = np.zeros(num, np.int32)
+    return SimulatedScan(points, np.full(num, times_s), np.zeros((num, 3)), ids, ids, np.zeros(num, bool), T_world_lidar)
 
 
 @pytest.fixture
@@ -25,7 +32,7 @@ def simulator(monkeypatch):
     def simulate_clip(kind, seed, *, num_frames, sensor):
         calls.append((kind, seed, sensor))
         poses = [street.pose(0.001 * (seed % 1000) + k) for k in range(num_frames)]
-        return [SimpleNamespace(points=street.scan(T, num_rings=8, num_columns=180).points, T_world_lidar=T) for T in poses]
+        return [sweep(T) for T in poses]
 
     monkeypatch.setattr(module, "simulate_clip", simulate_clip)
     return calls
@@ -108,3 +115,18 @@ def test_worlds_of_another_making_are_not_mixed_up(simulator, tmp_path, changed)
     assert len(simulator) == 0
     list(worlds(dataclasses.replace(CFG, **changed), tmp_path, validation=False))
     assert len(simulator) == 7
+
+
+def test_two_thirds_of_the_worlds_are_deskewed(monkeypatch):
+    """Oracle: the drive's own velocity. All points are 50 ms late: a de-skewed scan is 0.45 m ahead, within what the velocity is off."""
+    poses = [street.pose(0.9 * k) for k in range(3)]
+    monkeypatch.setattr(module, "simulate_clip", lambda *_arguments, **_options: [sweep(T, 0.05) for T in poses])
+    raw = module.preprocess(sweep(poses[0]).points, CFG.model.preprocess)
+    shifts = []
+    for index in range(60):
+        scans = module.make_world(index, seed=0, num_frames=3, cfg=CFG.model.preprocess).scans
+        shift = (scans.points[0] - raw.points)[raw.mask]
+        shifts.append(np.median(shift[:, 0]))
+    still = np.array(shifts) != 0.0
+    assert abs(still.mean() - 2 / 3) < 5 * np.sqrt(2 / 9 / 60)
+    np.testing.assert_allclose(np.array(shifts)[still], 0.45, atol=5 * 0.2 * 0.05 + 0.1)

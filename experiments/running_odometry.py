@@ -1,0 +1,309 @@
+"""The running odometry beside its own parts and beside KISS-ICP, VGICP and GICP: drift, error per step, time.
+
+Four simulated drives of exact truth, as measured by a turning sensor, and the recorded sequences, with `poses_boresight` as truth.
+One loop per scan: all methods see the same load, taking turns at who is first, on two cores, reading apart; scans of KITTI are
+elevation-corrected for all. Then every third scan only, the first pair from the identity. A drive is lost when its drift over
+10-50 m exceeds 10 %, or one step is off by more than 1 m. A ratio to a peer is that to the best one, metric by metric.
+
+The drives were chosen by their motion alone: of each kind the first seed, from 500,000, 501,000, 502,000 and 503,000 on, whose drive
+is 115 to 170 m long, so that every third scan is 3 to 4 m on, and whose body swings as those of KITTI do: the median change of
+pitch and roll rate from scan to scan lies within 0.075 to 0.15 deg per scan, as in the eleven official sequences (0.076 to 0.149).
+The rough drives, printed without a bound, are the first of each kind of that length whatever their swing, from 500,000, 500,100,
+500,200 and 500,300 on. Training uses seeds below 1,000 and from 1,000,000 on. Settings of the peers: see `_peers.py`.
+
+Run:     python experiments/running_odometry.py --data TREE       (about 20 minutes on 2 cores; needs kiss-icp and small_gicp)
+Expect:  all bounds kept; the timing bounds want an otherwise idle machine.
+"""
+
+import os
+import time
+from typing import NamedTuple
+
+import _harness
+import numpy as np
+from _harness import Row
+from _peers import NUM_THREADS, Drive, Gicp, Kiss, Odometry, Sweep, Vgicp, recorded, simulated
+from rich.progress import Progress
+
+import delo_jax
+from delo_jax.errors import DeloError
+from delo_jax.geometry import se3
+from delo_jax.metrics.ate import relative_errors
+from delo_jax.metrics.drift import kitti_drift
+from delo_jax.model.delo import Model
+from delo_jax.pipeline.scan_to_map import Steps
+
+DRIVES = {"urban": 500_127, "mixed": 501_127, "open": 502_100, "residential": 503_002}
+ROUGH = {"rough urban": 500_000, "rough mixed": 500_103, "rough open": 500_200, "rough residential": 500_306}
+SIMULATED = DRIVES | ROUGH
+SEQUENCES = ("odo_04_000", "raw_0926_0013", "odo_00_056")
+TIMED = ("odo_04_000", "raw_0926_0013")  # with bounds on the time
+NUM_SCANS, NUM_QUICK, GAP = 130, 25, 3
+NUM_WARM_UP = 5  # scans whose time does not count: they compile
+SHORT_M, LONG_M = tuple(range(10, 51, 10)), tuple(range(60, 101, 10))
+LOST_PERCENT, LOST_STEP_M = 10.0, 1.0
+AS_GOOD = 1.05
+NOWHERE = np.eye(4) + 1e6 * np.eye(4, k=3)  # in place of a pose that is not finite
+
+Bounds = tuple[float | None, float | None]  # of translation and rotation
+WHAT, UNITS = ("translation", "rotation"), ("%", "deg/100m")
+MEAN_BOUNDS: Bounds = (0.10, 0.15)  # over the simulated drives
+REAL_BOUNDS: dict[str, Bounds] = {"odo_04_000": (0.23, 0.28)}
+MEAN_RATIOS: Bounds = (0.85, 0.85)  # to the best peer
+REAL_RATIOS: Bounds = (1.05, None)
+GAP_RATIO = 1.3
+P50_RATIO, P95_RATIO, SPREAD = 0.55, 0.4, 1.4
+
+OURS, CLASSICAL, KISS = "ours", "ours, no network", "KISS-ICP"
+ONE_PASS, KISS_STILL = "ours, one de-skew pass", "KISS-ICP, no de-skew"
+VGICP, GICP = "VGICP to model", "GICP scan to scan"
+PEERS = KISS, KISS_STILL, VGICP, GICP
+
+
+class Track(NamedTuple):
+    """What a method made of a drive."""
+
+    Ts_world_lidar: np.ndarray
+    seconds: np.ndarray
+    ok: float  # share of the frames with this status; NaN for the peers, which have none
+
+    def thinned(self) -> "Track":
+        """Every third pose."""
+        return self._replace(Ts_world_lidar=self.Ts_world_lidar[::GAP])
+
+
+class Numbers(NamedTuple):
+    """What is said of a track; NaN where the drive is too short."""
+
+    percent: float
+    deg: float  # per 100 m
+    long_percent: float
+    long_deg: float
+    step_cm: float  # median
+    step_deg: float
+    p50_ms: float
+    p95_ms: float
+    ok: float
+    worst_m: float  # largest error of a step
+
+    @property
+    def lost(self) -> bool:
+        """Whether the drive was lost."""
+        return self.percent > LOST_PERCENT or self.worst_m > LOST_STEP_M
+
+
+Table = dict[str, Numbers]
+
+
+class Ours:
+    """`LidarOdometry` as one of many."""
+
+    def __init__(self, params: Model, *, use_map: bool = True, steps: Steps | None = None):
+        self._odometry = delo_jax.LidarOdometry(params, use_map=use_map, steps=steps)
+
+    def register(self, sweep: Sweep) -> np.ndarray:
+        """T_world_lidar at the stamp."""
+        return self._odometry.register(sweep.points, sweep.stamp_ns, sweep.times_s).T_world_lidar
+
+    @property
+    def ok(self) -> float:
+        """Share of the frames with this status."""
+        return float(np.mean([status == "ok" for status in self._odometry.trajectory().statuses]))
+
+
+def methods(params: Model, *, skewed: bool) -> dict[str, Odometry]:
+    """Fresh odometries; where nothing is to be de-skewed, those that differ in it alone are left out."""
+    found: dict[str, Odometry] = {
+        OURS: Ours(params),
+        CLASSICAL: Ours(params, steps=Steps(num_learned=0)),
+        "ours, no classical end": Ours(params, steps=Steps(num_learned=6, num_robust=0)),
+        ONE_PASS: Ours(params, steps=Steps(num_passes=1)),
+        "ours, scan to scan": Ours(params, use_map=False),
+        KISS: Kiss(),
+        KISS_STILL: Kiss(deskew=False),
+        VGICP: Vgicp(),
+        GICP: Gicp(),
+    }
+    return found if skewed else {name: odometry for name, odometry in found.items() if name not in (ONE_PASS, KISS_STILL)}
+
+
+def follow(drive: Drive, params: Model, bar: Progress) -> dict[str, Track]:
+    """Every method along a drive, scan by scan."""
+    odometries = list(methods(params, skewed=drive.skewed).items())
+    poses: dict[str, list[np.ndarray]] = {name: [] for name, _ in odometries}
+    seconds: dict[str, list[float]] = {name: [] for name, _ in odometries}
+    for k, sweep in enumerate(bar.track(drive.sweeps, description=f"{drive.name}, {len(drive.sweeps)} scans")):
+        wide, first = sweep._replace(points=sweep.points.astype(np.float64)), k % len(odometries)
+        for name, odometry in odometries[first:] + odometries[:first]:
+            scan = wide if name in PEERS else sweep
+            begin = time.perf_counter()
+            T_world_lidar = odometry.register(scan)
+            seconds[name].append(time.perf_counter() - begin)
+            poses[name].append(np.array(T_world_lidar))
+    return {
+        name: Track(np.array(poses[name]), np.array(seconds[name]), odometry.ok if isinstance(odometry, Ours) else np.nan)
+        for name, odometry in odometries
+    }
+
+
+def numbers(track: Track, Ts_true: np.ndarray) -> Numbers:
+    """A track against the truth."""
+    usable = np.isfinite(track.Ts_world_lidar).all(axis=(1, 2), keepdims=True)
+    Ts = np.where(usable, track.Ts_world_lidar, NOWHERE)
+    steps = relative_errors(Ts, Ts_true)
+    milliseconds = 1e3 * track.seconds[min(NUM_WARM_UP, len(track.seconds) // 2) :]
+    return Numbers(
+        *drift(Ts, Ts_true, SHORT_M),
+        *drift(Ts, Ts_true, LONG_M),
+        100 * float(np.median(steps.translation_m)),
+        float(np.degrees(np.median(steps.rotation_rad))),
+        float(np.median(milliseconds)),
+        float(np.percentile(milliseconds, 95)),
+        track.ok,
+        float(steps.translation_m.max()),
+    )
+
+
+def drift(Ts: np.ndarray, Ts_true: np.ndarray, lengths_m: tuple[int, ...]) -> tuple[float, float]:
+    """Percent and degrees per 100 m, from every start; NaN where the drive is shorter than all segments."""
+    try:
+        found = kitti_drift(Ts, Ts_true, lengths_m=lengths_m, step=1)
+    except DeloError:
+        return np.nan, np.nan
+    return found.t_rel_percent, found.r_rel_deg_per_100m
+
+
+def show(title: str, table: Table) -> None:
+    """All numbers of the methods on a drive."""
+    print(f"\n## {title}\n\n| method | 10-50 m: % | deg/100 m | 60-100 m: % | deg/100 m | step: cm | deg | p50 ms | p95 ms | ok % |")
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|")
+    for name, n in table.items():
+        cells = " | ".join(_cell(value, 3) for value in n[:6])
+        print(f"| {name} | {cells} | {n.p50_ms:.1f} | {n.p95_ms:.1f} | {_cell(100 * n.ok, 1)} |", flush=True)
+
+
+def show_thinned(title: str, thin: Table, whole: Table, same: Table) -> None:
+    """Every third scan beside all of them: as in the table above, and over the same segments, which end at thinned scans."""
+    print(f"\n## {title}, every third scan\n")
+    print("| method | 10-50 m: % | deg/100 m | worst step m | ok % | lost | % / that of all scans | over the same segments |")
+    print("|---|---:|---:|---:|---:|---|---:|---:|")
+    for name, n in thin.items():
+        ratios = " | ".join(_cell(n.percent / table[name].percent, 2) for table in (whole, same))
+        cells = " | ".join(_cell(c, 3) for c in (n.percent, n.deg, n.worst_m))
+        print(f"| {name} | {cells} | {_cell(100 * n.ok, 1)} | {'LOST' if n.lost else ''} | {ratios} |", flush=True)
+
+
+def _cell(value: float, digits: int) -> str:
+    return "-" if np.isnan(value) else f"{value:.{digits}f}"
+
+
+def measure(drive: Drive, params: Model, bar: Progress) -> tuple[Table, Table]:
+    """Tables of a drive: all scans, every third; the latter empty for a rough drive."""
+    tracks, thin = follow(drive, params, bar), drive.thinned(GAP)
+    table = {name: numbers(track, drive.Ts_world_lidar) for name, track in tracks.items()}
+    length_m = np.linalg.norm(np.diff(drive.Ts_world_lidar[:, :3, 3], axis=0), axis=1).sum()
+    state = "as measured" if drive.skewed else "motion-compensated"
+    show(f"{drive.name}: {len(drive.sweeps)} scans, {length_m:.0f} m, {state}, swing {swing_deg(drive.Ts_world_lidar):.2f} deg", table)
+    if drive.name in ROUGH:
+        return table, {}
+    same = {name: numbers(track.thinned(), thin.Ts_world_lidar) for name, track in tracks.items()}
+    thinned = {name: numbers(track, thin.Ts_world_lidar) for name, track in follow(thin, params, bar).items()}
+    show_thinned(drive.name, thinned, table, same)
+    return table, thinned
+
+
+def swing_deg(Ts_world_lidar: np.ndarray) -> float:
+    """Median change of the pitch and roll rates from scan to scan [deg per scan]."""
+    motions = se3.log(se3.inverse(Ts_world_lidar[:-1]) @ Ts_world_lidar[1:])
+    return float(np.degrees(np.median(np.linalg.norm(np.diff(motions[:, :2], axis=0), axis=1))))
+
+
+def accuracy_rows(name: str, table: Table, bounds: Bounds, ratios: Bounds) -> list[Row]:
+    """Drift of ours over 10-50 m, and as a multiple of the best peer's: translation, rotation."""
+    rows = []
+    for what, unit, of, bound, ratio in zip(WHAT, UNITS, (lambda n: n.percent, lambda n: n.deg), bounds, ratios, strict=True):
+        ours, best = of(table[OURS]), min(of(table[peer]) for peer in PEERS if peer in table)
+        rows += [Row(f"{name}: drift", ours, unit, bound), Row(f"{name}: {what} drift / that of the best peer", ours / best, "", ratio)]
+    return rows
+
+
+def time_rows(name: str, table: Table) -> list[Row]:
+    """Time per scan of ours, as a multiple of KISS-ICP's in the same loop."""
+    ours, kiss = table[OURS], table[KISS]
+    return [
+        Row(f"{name}: p50 of the time / that of KISS-ICP", ours.p50_ms / kiss.p50_ms, "", P50_RATIO),
+        Row(f"{name}: p95 of the time / that of KISS-ICP", ours.p95_ms / kiss.p95_ms, "", P95_RATIO),
+        Row(f"{name}: p95 / p50 of the time", ours.p95_ms / ours.p50_ms, "", SPREAD),
+    ]
+
+
+def thinned_rows(whole: dict[str, Table], thin: dict[str, Table]) -> list[Row]:
+    """Every third scan: drives that ours lost, and its drift as a multiple of that of all scans."""
+    lost = [drive for drive, table in thin.items() if table[OURS].lost]
+    rows = [Row(f"every third scan: drives lost{': ' if lost else ''}{', '.join(lost)}", len(lost), "", 0.0)]
+    for drive, table in thin.items():
+        ratio = table[OURS].percent / whole[drive][OURS].percent
+        rows.append(Row(f"{drive}, every third scan: drift / that of all scans", ratio, "", GAP_RATIO))
+    return rows
+
+
+def mean(tables: list[Table]) -> Table:
+    """Mean over drives, method by method."""
+    return {name: Numbers(*np.mean([table[name] for table in tables], axis=0).tolist()) for name in tables[0]}
+
+
+def network_sentence(average: Table, thin: dict[str, Table]) -> str:
+    """Whether the classical solver alone is as accurate, in the numbers of this run."""
+    ours, alone = average[OURS], average[CLASSICAL]
+    as_good = alone.percent <= AS_GOOD * ours.percent and alone.deg <= AS_GOOD * ours.deg
+    lost = {name: sum(table[name].lost for table in thin.values()) for name in (OURS, CLASSICAL)}
+    return (
+        f"The classical solver alone drifts {alone.percent:.3f} % and {alone.deg:.3f} deg/100 m in the mean, against {ours.percent:.3f} % "
+        f"and {ours.deg:.3f} deg/100 m with the network: {'as accurate' if as_good else 'less accurate'} (within 5 % in both, or not); "
+        f"of {len(thin)} drives at every third scan it loses {lost[CLASSICAL]}, with the network {lost[OURS]} are lost."
+    )
+
+
+def judge(whole: dict[str, Table], thin: dict[str, Table]) -> list[Row]:
+    """All rows; prints the means and what the network buys on the way."""
+    rows, drives, rough = [], *([table for name, table in whole.items() if name in group] for group in (DRIVES, ROUGH))
+    if drives:
+        show(f"mean of {len(drives)} simulated drives", mean(drives))
+        rows += accuracy_rows("simulated drives, mean", mean(drives), MEAN_BOUNDS, MEAN_RATIOS)
+    if rough:
+        show(f"mean of {len(rough)} rough drives", mean(rough))
+        rows += accuracy_rows("rough drives, mean", mean(rough), (None, None), (None, None))
+    print("\n" + network_sentence(mean(drives or list(whole.values())), thin))
+    for name, table in whole.items():
+        if name not in SIMULATED:
+            rows += accuracy_rows(name, table, REAL_BOUNDS.get(name, (None, None)), REAL_RATIOS)
+        if name in TIMED:
+            rows += time_rows(name, table)
+    return rows + thinned_rows(whole, thin)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure, print, judge."""
+    parser = _harness.parser(__doc__, needs_data=True)
+    parser.add_argument("--weights", default="delo-base", help="name or file")
+    parser.add_argument("--drives", nargs="*", choices=list(SIMULATED), default=list(SIMULATED), help="simulated ones; none for no drive")
+    parser.add_argument("--sequences", nargs="*", default=list(SEQUENCES), help="of the data tree; none for no sequence")
+    args = parser.parse_args(argv)
+    if hasattr(os, "sched_setaffinity"):  # JAX has no setting for its number of threads
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:NUM_THREADS])
+    params = delo_jax.load(args.weights)
+    whole: dict[str, Table] = {}
+    thin: dict[str, Table] = {}
+    with _harness.progress() as bar:
+        for name in [*args.drives, *args.sequences][: 1 if args.quick else None]:
+            if name in SIMULATED:
+                drive = simulated(name, SIMULATED[name], NUM_QUICK if args.quick else NUM_SCANS, bar)
+            else:
+                drive = recorded(args.data, name, NUM_QUICK if args.quick else None, bar)
+            whole[name], thinned = measure(drive, params, bar)
+            thin |= {name: thinned} if thinned else {}
+    return _harness.finish(judge(whole, thin), {"weights": args.weights, "drives": SIMULATED, "num_scans": NUM_SCANS, "gap": GAP}, args)
+
+
+if __name__ == "__main__":
+    _harness.run(main)
