@@ -3,7 +3,7 @@
 Each event strikes the odometry on its local map in the middle of 40 scans of the drives of `running_odometry.py` (two of them as
 measured by the turning sensor, two motion-compensated) and of `odo_00_056`, before its turn:
 
-- sudden stop: from the speed it has to none in 0.2 s; swerve: 1.5 m aside in 0.6 s, nose first (simulated drives only);
+- sudden stop: from the speed it has to none in 0.2 s; swerve: 1.5 m aside in 1 s, nose first: 0.75 g, about what tyres hold (simulated drives only);
 - five scans dropped; a duplicate: the last scan once more at the stamp of the next; noise: points uniform in a box;
   half a scan: the left half only;
 - restart: off for 0.3 s, then 3 m farther on than constant velocity says, the sensor turned on its mount by 30 deg for good.
@@ -40,7 +40,7 @@ REAL = "odo_00_056"
 ROLLING = ("mixed", "residential")  # drives delivered as measured
 NUM_SCANS, EVENT, NUM_SPARE = 40, 20, 10  # scans, number of the first that the event touches, more of them where some are left out
 PERIOD_S = FRAME_PERIOD_NS * NANOSECOND
-STOP_S, SWERVE_S, SWERVE_M = 0.2, 0.6, 1.5
+STOP_S, SWERVE_S, SWERVE_M = 0.2, 1.0, 1.5
 NUM_DROPPED, NUM_OFF = 5, 3  # scans dropped; periods of the outage before a restart
 RESTART_M, RESTART_DEG = 3.0, 30.0
 NOISE_BOX_M = np.array([[-50.0, -50.0, -2.0], [50.0, 50.0, 10.0]])

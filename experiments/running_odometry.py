@@ -227,6 +227,16 @@ def accuracy_rows(name: str, table: Table, bounds: Bounds, ratios: Bounds) -> li
     return rows
 
 
+def best_of_each_rows(drives: list[Table]) -> list[Row]:
+    """Mean drift of ours as a multiple of that of whichever peer is best on each drive: no peer pays for one that it lost."""
+    rows = []
+    for what, of in zip(WHAT, (lambda n: n.percent, lambda n: n.deg), strict=True):
+        best = np.mean([min(of(table[peer]) for peer in PEERS) for table in drives])
+        ours = np.mean([of(table[OURS]) for table in drives])
+        rows.append(Row(f"simulated drives, mean: {what} drift / that of the best peer of each drive", float(ours / best), ""))
+    return rows
+
+
 def time_rows(name: str, table: Table) -> list[Row]:
     """Time per scan of ours, as a multiple of KISS-ICP's in the same loop."""
     ours, kiss = table[OURS], table[KISS]
@@ -270,6 +280,7 @@ def judge(whole: dict[str, Table], thin: dict[str, Table]) -> list[Row]:
     if drives:
         show(f"mean of {len(drives)} simulated drives", mean(drives))
         rows += accuracy_rows("simulated drives, mean", mean(drives), MEAN_BOUNDS, MEAN_RATIOS)
+        rows += best_of_each_rows(drives)
     if rough:
         show(f"mean of {len(rough)} rough drives", mean(rough))
         rows += accuracy_rows("rough drives, mean", mean(rough), (None, None), (None, None))

@@ -26,9 +26,12 @@ SWEEP_OPTIONS: dict[str, Any] = {
     "scale_m": SCALE_M,
     "reach_m": REACH_M,
     "num_steps": STEPS_PER_ROUND,
-    "sigma_velocity": (0.17, 0.2),  # of that at the stamp, about the mean since the last scan [rad/s, m/s]
+    "sigma_velocity": (0.5, 0.5),  # of that at the stamp, about the mean since the last scan [rad/s, m/s]
     "sigma_m": 0.002,  # of the mean plane distance of a scan
 }
+SETTLED = np.repeat([0.05, 0.15], 3)  # change of the velocity that needs no other round [rad/s, m/s]
+MAX_ROUNDS = 5
+UNSTEADY = np.repeat([0.35, 2.0], 3)  # change of the velocity, by which it is not constant within a sweep either [rad/s, m/s]
 MIN_TARGETS = 100
 RECOVERY_STEPS = 12
 INSERT_M, INSERT_DEG = 1.0, 5.0  # motion since the last insertion
@@ -56,6 +59,14 @@ class MapFix(NamedTuple):
     score: float  # mean robust weight of the scan's points, in [0, 1]
     rms_m: float  # weighted distance to the surfaces
     information: np.ndarray  # (6, 6), right perturbation, per unit of weight
+
+
+class SweepFix(NamedTuple):
+    """A sweep registered with its velocity."""
+
+    fix: MapFix
+    scan: PreparedScan  # de-skewed with the velocity found
+    change: np.ndarray  # (6,) of the velocity found from the one expected
 
 
 class Located(NamedTuple):
@@ -115,21 +126,18 @@ def register(
     return MapFix(T_start_lidar, float(fit.score), float(fit.rms_m), np.asarray(fit.information, np.float64))
 
 
-def register_sweep(
-    scan: PreparedScan, near: Surroundings, fix: MapFix, velocity: np.ndarray, num_rounds: int
-) -> tuple[PreparedScan, MapFix]:
-    """A sweep registered once more, its velocity solved for with its pose; the scan as de-skewed with it.
+def register_sweep(scan: PreparedScan, near: Surroundings, fix: MapFix, velocity: np.ndarray) -> SweepFix:
+    """A sweep registered once more, its velocity solved for with its pose; de-skewed anew as long as the velocity still changes.
 
     Args:
         scan: with times.
         near: the map that it was registered to.
         fix: where it is, de-skewed with another velocity.
         velocity: (6,) expected, [omega rad/s, v m/s].
-        num_rounds: searches for matches, each after a new de-skew.
     """
     times_s = np.asarray(scan.times_s)[:NUM_ROBUST_POINTS]
     found = velocity
-    for _ in range(num_rounds):
+    for _ in range(MAX_ROUNDS):
         scan = scan.still(found)
         fit = _sweep(scan, times_s, near, fix.T_start_lidar.astype(np.float32), velocity - found)
         if not (np.isfinite(fit.T_target_source).all() and np.isfinite(fit.velocity).all()):
@@ -137,7 +145,9 @@ def register_sweep(
         found = found + fit.velocity
         T_start_lidar = se3.exp(se3.log(fit.T_target_source.astype(np.float64)))
         fix = MapFix(T_start_lidar, float(fit.score), float(fit.rms_m), np.asarray(fit.information, np.float64))
-    return scan.still(found), fix
+        if np.all(np.abs(fit.velocity) < SETTLED):
+            break
+    return SweepFix(fix, scan.still(found), found - velocity)
 
 
 def _sweep(scan: PreparedScan, times_s: np.ndarray, near: Surroundings, T: np.ndarray, velocity_prior: np.ndarray):
@@ -218,9 +228,16 @@ class MapTracker:
                 steps = {"num_learned": num_learned, "num_robust": self._steps.num_robust, "skip": skip}
                 tries.append((register(self._params, scan, near, np.eye(4), **steps), T_since_guess, near))
         fix, T_since_guess, near = max(tries, key=lambda one: one[0].score)
+        change = np.zeros(6)
         if self._steps.num_passes > 1 and scan.times_s is not None and fix.score > 0.0:
-            scan, fix = register_sweep(scan, near, fix, se3.log(T_since_guess @ fix.T_start_lidar) / elapsed_s, self._steps.num_passes - 1)
-        return Located(self._judged(scan, fix, Ts_since_guess[0], T_since_guess), scan)
+            motions = [T_since_guess @ fix.T_start_lidar, *(Ts_since_guess if recovering else ())]
+            sweeps = [register_sweep(scan, near, fix, se3.log(T) / elapsed_s) for T in motions]
+            fix, scan, change = max(sweeps, key=lambda sweep: sweep.fix.score)
+        motion = self._judged(scan, fix, Ts_since_guess[0], T_since_guess)
+        if motion.status == "ok" and np.any(np.abs(change) > UNSTEADY):
+            what = f"{np.degrees(np.abs(change[:3]).max()):.0f} deg/s and {np.abs(change[3:]).max():.1f} m/s"
+            motion = dataclasses.replace(motion, status="low_confidence", reason=f"the velocity changed by {what} since the last scan")
+        return Located(motion, scan)
 
     def _judged(self, scan: PreparedScan, fix: MapFix, T_expected: np.ndarray, T_since_guess: np.ndarray) -> Estimate:
         """Motion, covariance and status of a fix."""
