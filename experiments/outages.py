@@ -3,7 +3,8 @@
 Each event strikes the odometry on its local map in the middle of 40 scans of the drives of `running_odometry.py` (two of them as
 measured by the turning sensor, two motion-compensated) and of `odo_00_056`, before its turn:
 
-- sudden stop: from the speed it has to none in 0.2 s; swerve: 1.5 m aside in 1 s, nose first: 0.75 g, about what tyres hold (simulated drives only);
+- sudden stop: from the speed it has to none in 0.2 s; swerve: 1.5 m aside in 1 s, nose first, which is 0.75 g, about what tyres hold
+  (both on simulated drives only);
 - five scans dropped; a duplicate: the last scan once more at the stamp of the next; noise: points uniform in a box;
   half a scan: the left half only;
 - restart: off for 0.3 s, then 3 m farther on than constant velocity says, the sensor turned on its mount by 30 deg for good.

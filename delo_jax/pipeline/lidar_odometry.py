@@ -57,8 +57,10 @@ class Anchor(NamedTuple):
 class LidarOdometry:
     """LiDAR odometry on a local map, or from scan to scan. Not thread-safe; one instance per sensor stream.
 
-    On the map, the motion model predicts and the scan is registered from there. Where that fails, at the first pair and after an
-    outage, the network aligns the scan with the last good one, with no prior, and the map judges its proposal.
+    On the map, a scan goes this way: prepared; predicted and de-skewed by the motion model; the map cropped in the predicted body
+    frame; learned steps of the fine stage; robust classical steps; once more with the velocity of the sweep free, where points
+    carry times; inserted. Where that fails, at the first pair and after an outage, the network aligns the scan with the last good
+    one, with no prior, and the map judges its proposal beside others.
 
     A bad scan never stops a drive: its pose is the motion model's, its status `rejected`, its covariance honest about it.
     The last good scan stays the source, so that the next pair bridges the gap; when it has gone out of reach, two

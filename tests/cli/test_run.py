@@ -83,11 +83,12 @@ def test_what_the_run_says_of_itself(folder, tree, weights_file):
     assert options["model"]["preprocess"]["max_points"] == 3072
 
 
-def test_run_on_a_map(tree, cli, tmp_path):
-    """Oracle: the option given, and the simulator's poses; released weights."""
-    code, printed, _ = cli("run", str(tree), "--map", "local", "--weights", "delo-base", "--out", str(tmp_path / "out"))
+@pytest.mark.parametrize(("options", "kind"), [((), "local"), (("--map", "none"), "none")])
+def test_run_with_and_without_a_map(tree, cli, tmp_path, options, kind):
+    """Oracle: the option given, a map by default, and the simulator's poses; released weights."""
+    code, printed, _ = cli("run", str(tree), *options, "--weights", "delo-base", "--out", str(tmp_path / "out"))
     assert code == 0, printed
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["map"] == "local"
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["map"] == kind
     assert check_whole(tmp_path / "out") == NUM_SCANS
     true = read_rows(tree / "poses" / f"{NAME}.txt")
     found = read_rows(tmp_path / "out" / "poses_kitti.txt")
