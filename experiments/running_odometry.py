@@ -17,7 +17,7 @@ Expect:  all bounds kept; the timing bounds want an otherwise idle machine.
 
 import os
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import _harness
 import numpy as np
@@ -28,10 +28,12 @@ from rich.progress import Progress
 import delo_jax
 from delo_jax.errors import DeloError
 from delo_jax.geometry import se3
+from delo_jax.inference import Estimate, PreparedScan
 from delo_jax.metrics.ate import relative_errors
 from delo_jax.metrics.drift import kitti_drift
 from delo_jax.model.delo import Model
 from delo_jax.pipeline.scan_to_map import Steps
+from delo_jax.uncertainty import covariance
 
 DRIVES = {"urban": 500_127, "mixed": 501_127, "open": 502_100, "residential": 503_002}
 ROUGH = {"rough urban": 500_000, "rough mixed": 500_103, "rough open": 500_200, "rough residential": 500_306}
@@ -95,11 +97,17 @@ class Numbers(NamedTuple):
 Table = dict[str, Numbers]
 
 
+def no_network(params: Model, source: PreparedScan, target: PreparedScan, T_target_source_init: np.ndarray) -> Estimate:
+    """In place of the network, where two scans are to be aligned: it has nothing to propose."""
+    known = covariance.unknown(params.cfg.status)
+    return Estimate(T_target_source=T_target_source_init, **known._asdict(), status="rejected", confidence=0.0, reason="no network")
+
+
 class Ours:
     """`LidarOdometry` as one of many."""
 
-    def __init__(self, params: Model, *, use_map: bool = True, steps: Steps | None = None):
-        self._odometry = delo_jax.LidarOdometry(params, use_map=use_map, steps=steps)
+    def __init__(self, params: Model, **options: Any):
+        self._odometry = delo_jax.LidarOdometry(params, **options)
 
     def register(self, sweep: Sweep) -> np.ndarray:
         """T_world_lidar at the stamp."""
@@ -115,7 +123,7 @@ def methods(params: Model, *, skewed: bool) -> dict[str, Odometry]:
     """Fresh odometries; where nothing is to be de-skewed, those that differ in it alone are left out."""
     found: dict[str, Odometry] = {
         OURS: Ours(params),
-        CLASSICAL: Ours(params, steps=Steps(num_learned=0)),
+        CLASSICAL: Ours(params, steps=Steps(num_learned=0), align=no_network),
         "ours, no classical end": Ours(params, steps=Steps(num_learned=6, num_robust=0)),
         ONE_PASS: Ours(params, steps=Steps(num_passes=1)),
         "ours, scan to scan": Ours(params, use_map=False),
