@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from delo_jax.cli.simulated import SimulatedDrive
 
-KIND, SEED = "urban", 3  # 71 m at 12 m/s, a bend of 22 deg
+KIND, SEED = "urban", 500_063  # 84 m, a bend of 14 deg; a drive that training never saw
 POINTS_PER_PICTURE = 150_000
 
 

@@ -227,7 +227,7 @@ def _facts(job: Job, card: dict[str, Any], compile_s: float) -> dict[str, Any]:
         "num_scans": len(job.source),
         "poses_kitti_frame": "lidar" if T_cam_lidar is None else "camera",
         "T_cam_lidar": None if T_cam_lidar is None else T_cam_lidar.tolist(),
-        "uncertainty": "evidence head, not calibrated",
+        "uncertainty": f"{'information matrix' if job.use_map else 'evidence head'}, not calibrated",
         "compile_s": round(compile_s, 3),
     }
 

