@@ -90,6 +90,7 @@ class LidarOdometry:
         self._map = MapTracker(params, steps or Steps()) if use_map else None
         self._anchor: Anchor | None = None  # the last good scan
         self._doubtful: Anchor | None = None  # the newest usable scan that did not fit it
+        self._map_refused = False  # by the map: the last scan, though it fits the one before it
         self._num_frames, self._last_stamp_ns, self._num_rejected = 0, 0, 0
         self._trajectory = Trajectory()
 
@@ -166,6 +167,7 @@ class LidarOdometry:
             guess = self._motion_model.predict(elapsed_s)
             expected = tracker.locate(target.scan, self._anchor.T_world_lidar, [guess], elapsed_s, recovering=False)
             if expected.motion.status in ("ok", "degenerate") and is_near(guess, expected.motion.T_target_source):
+                self._map_refused = False
                 return expected.motion, target._replace(scan=expected.scan)
         return self._recover(target, tracker, expected)
 
@@ -173,7 +175,7 @@ class LidarOdometry:
         """Motion to a scan that is not where it was expected, or of which nothing was expected: the best of several hypotheses.
 
         The network aligns it with the last good scan; the map judges that pose and the predicted ones, each from two subsets of
-        points. Where the network is sure and the map has none that fits, a new map begins.
+        points. Where the network is sure and the map has none that fits, the network's stands; the second time a new map begins.
         """
         before = self._anchor
         pair, aligned = self._locate(target)
@@ -190,8 +192,12 @@ class LidarOdometry:
         found = tracker.locate(aligned.scan, since.T_world_lidar, guesses, elapsed_s, recovering=True)
         if expected is not None and expected.motion.confidence >= found.motion.confidence:
             found = expected
+        if found.motion.status != "rejected":
+            self._map_refused = False
         if found.motion.status == "rejected" and pair.status == "ok":
-            tracker.restart(since.source.scan, since.T_world_lidar)
+            if self._map_refused:
+                tracker.restart(since.source.scan, since.T_world_lidar)
+            self._map_refused = not self._map_refused
             reason = f"the map does not fit ({found.motion.reason}); aligned with the last good scan alone"
             return dataclasses.replace(pair, status="low_confidence", reason=reason), aligned
         return found.motion, aligned._replace(scan=found.scan)

@@ -201,3 +201,27 @@ def test_map_begins_anew_elsewhere():
     for k in (22, 23):
         found = np.linalg.inv(frames[k - 18].T_world_lidar) @ frames[k - 17].T_world_lidar
         assert errors(found, np.linalg.inv(pose_at(k - 1)) @ pose_at(k))[0] < 0.1
+
+
+def in_a_crowd(k, num_blobs):
+    """A scan with things in it that are nowhere else."""
+    rng = np.random.default_rng(k)
+    blobs = rng.uniform([-40, -40, 0], [40, 40, 12], (num_blobs, 1, 3)) + 0.3 * rng.normal(size=(num_blobs, 40, 3))
+    return np.concatenate([sweep(k), blobs.reshape(-1, 3).astype(np.float32)])
+
+
+def test_score_that_falls_is_noticed():
+    """Oracle: the construction: many surfaces of a scan are nowhere else; its pose is still right, and the next scan is ok."""
+    frames = drive([*(sweep(k) for k in range(6)), in_a_crowd(6, 300), sweep(7)])
+    assert [frame.status for frame in frames] == ["ok"] * 6 + ["low_confidence", "ok"]
+    assert frames[6].motion.confidence < 0.8
+    assert errors(frames[6].T_world_lidar, np.linalg.inv(pose_at(0)) @ pose_at(6))[0] < 0.1
+
+
+def test_network_stands_where_the_map_does_not_fit():
+    """Oracle: the truth; scans in so thick a crowd that the map refuses them, one after the other, still follow from each other."""
+    frames = drive([*(sweep(k) for k in range(4)), in_a_crowd(4, 600), sweep(5), sweep(6)])
+    assert [frame.status for frame in frames] == ["ok"] * 4 + ["low_confidence", "ok", "ok"]
+    assert frames[4].motion.reason.startswith("the map does not fit (confidence 0.")
+    for k in (4, 5, 6):
+        assert errors(frames[k].T_world_lidar, np.linalg.inv(pose_at(0)) @ pose_at(k))[0] < 0.15
