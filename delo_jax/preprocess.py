@@ -112,6 +112,8 @@ def still(scan: Scan, times_s: np.ndarray, velocity: np.ndarray) -> Scan:
         times_s: (m,) of its points, relative to the stamp.
         velocity: (6,) of the body, [omega rad/s, v m/s].
     """
+    if scan.mask.any():  # padding must not widen the sweep
+        times_s = np.where(scan.mask, times_s, times_s[0])
     poses = sweep_poses(times_s, velocity)
     points = np.einsum("nij,nj->ni", poses[:, :3, :3], scan.points) + np.where(scan.mask[:, None], poses[:, :3, 3], np.float32(0.0))
     normals = np.einsum("nij,nj->ni", poses[:, :3, :3], scan.normals) if len(scan.normals) else scan.normals
@@ -130,9 +132,12 @@ def _raw_scan(columns: np.ndarray, cfg: PreprocessConfig, rng: np.random.Generat
 
 def _crop(columns: np.ndarray, cfg: PreprocessConfig) -> np.ndarray:
     """Rows whose first three columns, a point, are in range."""
+    columns = np.ascontiguousarray(columns)
     with np.errstate(invalid="ignore", over="ignore"):
-        squared_range = np.einsum("ij,ij->i", columns[:, :3], columns[:, :3])
-        return columns[(squared_range >= cfg.min_range_m**2) & (squared_range < cfg.max_range_m**2)]  # NaN compares False
+        x, y, z = columns[:, 0], columns[:, 1], columns[:, 2]
+        squared_range = x * x + y * y + z * z
+        kept = (squared_range >= cfg.min_range_m**2) & (squared_range < cfg.max_range_m**2)  # NaN compares False
+    return columns.take(np.flatnonzero(kept), axis=0)
 
 
 def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:
@@ -147,10 +152,10 @@ def voxel_mean(columns: np.ndarray, size: float) -> np.ndarray:
         return columns
     keys = voxel_keys(columns[:, :3], size)
     order = np.argsort(keys, kind="stable")
-    keys = keys[order]
+    keys = keys.take(order)
     starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
     counts = np.diff(np.r_[starts, len(keys)]).astype(np.float32)
-    return np.add.reduceat(columns[order], starts, axis=0) / counts[:, None]
+    return np.add.reduceat(columns.take(order, axis=0), starts, axis=0) / counts[:, None]
 
 
 def one_per_voxel(points: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:

@@ -1,7 +1,10 @@
 """Drives, and peer odometries behind one call: two threads, settings tried on simulated drives of other seeds."""
 
+import os
 from pathlib import Path
 from typing import NamedTuple, Protocol
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read at load: idle threads of one method must not run into the time of the next
 
 import _harness
 import numpy as np

@@ -34,9 +34,9 @@ from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.geometry import se3
 from delo_jax.metrics.registration import pose_errors
 from delo_jax.model.delo import Model
-from delo_jax.pipeline.local_map import LocalMap
+from delo_jax.pipeline.local_map import LocalMap, surfaces_of
 from delo_jax.pipeline.motion_model import NANOSECOND
-from delo_jax.pipeline.scan_to_map import NUM_LEARNED_POINTS, RECOVERY_STEPS, MapTracker, Steps, Surroundings, register, surfaces_of
+from delo_jax.pipeline.scan_to_map import NUM_LEARNED_POINTS, RECOVERY_STEPS, MapTracker, Steps, Surroundings, register
 from delo_jax.sim import simulate_drive
 
 REAL, NUM_SCANS, NUM_REAL = "odo_00_056", 60, 40
@@ -46,7 +46,7 @@ HEIGHT_M, TILT_DEG = 0.1, 0.5  # one sigma
 BACK_M, BACK_DEG = 0.15, 0.3
 PERIOD_S = FRAME_PERIOD_NS * NANOSECOND
 CLOUD_M, VOXEL_M, VGICP_ROUNDS, VGICP_GATE_M = 0.5, 1.0, 60, 5.0  # more rounds and a wider gate than the defaults: better
-NUM_ROBUST = 30  # steps of the classical solver alone
+NUM_ROUNDS = 15  # of the classical solver alone
 CLOSING_GATE = ((6.0, 15.0),) * 6 + ((3.0, 10.0),) * 6 + ((1.0, 5.0),) * 6 + ((0.3, 2.0),) * 6  # scale and reach of each round [m]
 
 FINE, COARSE, TRUTH = "fine stage", "with the coarse stage", "fine stage from the truth"
@@ -111,19 +111,19 @@ def vgicp(scene: Scene, T_world_start: np.ndarray) -> np.ndarray:
 def classical(scene: Scene, T_world_start: np.ndarray) -> np.ndarray:
     """Robust point to plane on the same map at the gate of the pipeline, more rounds."""
     near = Surroundings(scene.local_map, T_world_start)
-    fix = register(scene.params, scene.scan, near, np.eye(4), num_learned=0, num_robust=NUM_ROBUST)
+    fix = register(scene.params, scene.scan, near, np.eye(4), num_learned=0, num_rounds=NUM_ROUNDS)
     return T_world_start @ fix.T_start_lidar
 
 
 def closing(scene: Scene, T_world_start: np.ndarray) -> np.ndarray:
     """The same behind rounds on fewer points whose gate closes."""
-    near, source = Surroundings(scene.local_map, T_world_start), surfaces_of(scene.scan, slice(0, NUM_LEARNED_POINTS))
+    near, source = Surroundings(scene.local_map, T_world_start), surfaces_of(scene.scan.scan, slice(0, NUM_LEARNED_POINTS))
     T = np.eye(4, dtype=np.float32)
     for scale_m, reach_m in CLOSING_GATE:
         matched = near.matches(source, T)
         rows = source.points, source.normals, source.mask, matched.points, matched.normals
         T = np.asarray(inference.robust_steps(*rows, T, scale_m=scale_m, reach_m=reach_m, num_steps=2).T_target_source)
-    fix = register(scene.params, scene.scan, near, T.astype(np.float64), num_learned=0, num_robust=Steps().num_robust)
+    fix = register(scene.params, scene.scan, near, T.astype(np.float64), num_learned=0, num_rounds=2)
     return T_world_start @ fix.T_start_lidar
 
 
@@ -164,7 +164,7 @@ def measure(drive: Drive, params: Model, num_frames: int, bar: Progress) -> list
         jax.block_until_ready(scan.encoding)
         if last is not None and k in frames:
             trials += searches(drive.name, Scene(params, scan, *last, local_map, tracker, cloud, voxel_map), T, k)
-        local_map.insert(surfaces_of(scan), T)
+        local_map.insert(surfaces_of(scan.scan), T)
         local_map.prune(T)
         tracker.insert(scan, T)
         voxel_map.insert(cloud, T)

@@ -123,9 +123,9 @@ def methods(params: Model, *, skewed: bool) -> dict[str, Odometry]:
     """Fresh odometries; where nothing is to be de-skewed, those that differ in it alone are left out."""
     found: dict[str, Odometry] = {
         OURS: Ours(params),
-        CLASSICAL: Ours(params, steps=Steps(num_learned=0), align=no_network),
-        "ours, no classical end": Ours(params, steps=Steps(num_learned=6, num_robust=0)),
-        ONE_PASS: Ours(params, steps=Steps(num_passes=1)),
+        CLASSICAL: Ours(params, steps=Steps(num_learned=0, num_rounds=3), align=no_network),
+        "ours, no classical end": Ours(params, steps=Steps(num_learned=6, num_rounds=0)),
+        ONE_PASS: Ours(params, steps=Steps(deskew_again=False)),
         "ours, scan to scan": Ours(params, use_map=False),
         KISS: Kiss(),
         KISS_STILL: Kiss(deskew=False),

@@ -28,7 +28,7 @@ from delo_jax.pipeline.scan_to_map import compile_steps
 from delo_jax.pipeline.trajectory import RunWriter, Trajectory
 from delo_jax.report.figures import trajectory_figure
 
-STAGES = ("prepare", "solve")
+STAGES = ("prepare", "solve", "insert")
 
 
 @runtime_checkable
@@ -126,6 +126,7 @@ def track(job: Job) -> Result:
         DeloError: weights that cannot be used, or a folder that cannot be written.
     """
     params, card = weights.load(job.weights), weights.read_card(job.weights)
+    odometry = LidarOdometry(params, use_map=job.use_map, deskew=job.deskew)
     with working("compiling"):
         compile_s = compile_model(params, use_map=job.use_map)
     print(f"compiled in {compile_s:.1f} s")
@@ -137,7 +138,6 @@ def track(job: Job) -> Result:
         writer = RunWriter(job.folder, T_cam_lidar=job.source.T_cam_lidar, timing_names=(job.stage, *STAGES))
     except OSError as error:
         raise ConfigError(f"--out {job.folder}: expected a folder to write to, got {error.strerror}; choose another") from error
-    odometry = LidarOdometry(params, use_map=job.use_map, deskew=job.deskew)
     with writer:
         acquired, interrupted = _loop(job, odometry, writer)
     result = _result(job, odometry.trajectory(), acquired, compile_s, interrupted)

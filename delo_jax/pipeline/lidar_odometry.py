@@ -59,8 +59,8 @@ class LidarOdometry:
 
     On the map, a scan goes this way: prepared; predicted and de-skewed by the motion model; the map cropped in the predicted body
     frame; learned steps of the fine stage; robust classical steps; once more with the velocity of the sweep free, where points
-    carry times; inserted. Where that fails, at the first pair and after an outage, the network aligns the scan with the last good
-    one, with no prior, and the map judges its proposal beside others.
+    carry times; inserted. Where that fails, at the first pair, after a gap and after a surprise, the network aligns the scan with
+    the last good one, from the identity's hypothesis and the prediction's, and the map judges its proposal beside others.
 
     A bad scan never stops a drive: its pose is the motion model's, its status `rejected`, its covariance honest about it.
     The last good scan stays the source, so that the next pair bridges the gap; when it has gone out of reach, two
@@ -68,11 +68,14 @@ class LidarOdometry:
 
     Args:
         params: weights, from `delo_jax.load`.
-        use_map: register to a local map of what was seen lately, rather than to the last scan.
+        use_map: register to a local map of what was seen lately, rather than to the last scan; presets without a fine stage cannot.
         deskew: undo the motion within a sweep where points carry times.
         steps: how a scan is registered to the map.
         prepare: raw points and their times to a scan; `inference.prepare` by default.
         align: two scans and a start to an estimate; `inference.align` by default.
+
+    Raises:
+        ConfigError: a map is asked for, and the network has no fine stage.
     """
 
     def __init__(
@@ -90,7 +93,7 @@ class LidarOdometry:
         self._map = MapTracker(params, steps or Steps()) if use_map else None
         self._anchor: Anchor | None = None  # the last good scan
         self._doubtful: Anchor | None = None  # the newest usable scan that did not fit it
-        self._map_refused = False  # by the map: the last scan, though it fits the one before it
+        self._map_refused = False  # the map refused the last scan, though it fits the one before it
         self._num_frames, self._last_stamp_ns, self._num_rejected = 0, 0, 0
         self._trajectory = Trajectory()
 
@@ -158,17 +161,16 @@ class LidarOdometry:
         return motion, aligned
 
     def _locate_on_map(self, target: Source, tracker: MapTracker) -> tuple[Estimate, Source]:
-        """Motion to a new scan by the map, from the motion model's prediction; where that is bad, from the network's proposal."""
+        """Motion to a new scan by the map, from the motion model's prediction; where that is bad, from other hypotheses."""
         if self._anchor is None:
             return self._first(target), target
-        expected = None
-        if self._motion_model.velocity is not None and self._motion_model.earlier is None:
-            elapsed_s = self._elapsed_s(self._anchor.source, target)
+        expected, elapsed_s = None, self._elapsed_s(self._anchor.source, target)
+        if self._motion_model.can_tell(elapsed_s):
             guess = self._motion_model.predict(elapsed_s)
             expected = tracker.locate(target.scan, self._anchor.T_world_lidar, [guess], elapsed_s, recovering=False)
             if expected.motion.status in ("ok", "degenerate") and is_near(guess, expected.motion.T_target_source):
                 self._map_refused = False
-                return expected.motion, target._replace(scan=expected.scan)
+                return tracker.accept(expected), target._replace(scan=expected.scan)
         return self._recover(target, tracker, expected)
 
     def _recover(self, target: Source, tracker: MapTracker, expected: Located | None) -> tuple[Estimate, Source]:
@@ -176,31 +178,37 @@ class LidarOdometry:
 
         The network aligns it with the last good scan; the map judges that pose and the predicted ones, each from two subsets of
         points. Where the network is sure and the map has none that fits, the network's stands; the second time a new map begins.
+        Where nothing fits the last good scan, but the scan fits a doubtful one, that one takes over, with a new map.
         """
-        before = self._anchor
-        pair, aligned = self._locate(target)
-        since = self._anchor
-        assert since is not None
-        if since is not before:  # a doubtful scan took over: where it is on the old map, nobody knows
-            expected = None
-        if since is not before or self._motion_model.velocity is None:
+        assert self._anchor is not None
+        pair, aligned = self._align_to(self._anchor.source, target)
+        since = self._anchor  # its scan may have been de-skewed by its first motion
+        if self._motion_model.velocity is None:
             tracker.restart(since.source.scan, since.T_world_lidar)
         elapsed_s = self._elapsed_s(since.source, target)
         guesses = self._motion_model.predictions(elapsed_s)
         if pair.status != "rejected":
             guesses.append(pair.T_target_source)
         found = tracker.locate(aligned.scan, since.T_world_lidar, guesses, elapsed_s, recovering=True)
-        if expected is not None and expected.motion.confidence >= found.motion.confidence:
+        if expected is not None and expected.score > found.score:
             found = expected
         if found.motion.status != "rejected":
             self._map_refused = False
-        if found.motion.status == "rejected" and pair.status == "ok":
+            return tracker.accept(found), aligned._replace(scan=found.scan)
+        if pair.status == "ok":
             if self._map_refused:
                 tracker.restart(since.source.scan, since.T_world_lidar)
             self._map_refused = not self._map_refused
             reason = f"the map does not fit ({found.motion.reason}); aligned with the last good scan alone"
             return dataclasses.replace(pair, status="low_confidence", reason=reason), aligned
-        return found.motion, aligned._replace(scan=found.scan)
+        self._map_refused = False
+        if self._doubtful is not None:
+            second, aligned = self._align_to(self._doubtful.source, target)
+            if second.status == "ok":
+                self._anchor = self._doubtful
+                tracker.restart(self._doubtful.source.scan, self._doubtful.T_world_lidar)
+                return second, aligned
+        return found.motion, target
 
     def _first(self, target: Source) -> Estimate:
         """The first scan is the world, unless it is unusable."""
@@ -252,8 +260,10 @@ class LidarOdometry:
             if anchor is not None:
                 self._motion_model.update(motion.T_target_source, (stamp_ns - anchor.source.stamp_ns) * NANOSECOND)
             self._anchor, self._doubtful, self._num_rejected = Anchor(target, T_world_lidar, covariance_world), None, 0
-            if self._map is not None:
+            if self._map is not None and not self._map_refused:
+                begin = time.perf_counter()
                 self._map.insert(target.scan, T_world_lidar)
+                timing = {**timing, "insert": time.perf_counter() - begin}
         elif target is not None and anchor is not None and target.scan.num_points >= self._params.cfg.status.min_points:
             self._doubtful = Anchor(target, T_world_lidar, covariance_world)
         self._num_frames, self._last_stamp_ns = number + 1, stamp_ns

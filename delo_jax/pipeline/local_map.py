@@ -7,10 +7,16 @@ import numpy as np
 from delo_jax.config import NUM_FEATURES
 from delo_jax.geometry import se3
 from delo_jax.model.delo import Surfaces
-from delo_jax.preprocess import posed_features, voxel_keys
+from delo_jax.preprocess import Scan, posed_features, voxel_keys
 
 SAME_SURFACE = 0.5  # cosine between normals above which two observations are of one surface
+CROP_M = 60.0  # of the map around a predicted pose
 MUCH_NEARER = 0.5  # of the range at which a voxel was seen: a nearer observation replaces it
+
+
+def surfaces_of(scan: Scan, rows: slice = slice(None)) -> Surfaces:
+    """What a scan shows, in those rows."""
+    return Surfaces(scan.points[rows], scan.normals[rows], scan.features[rows], scan.mask[rows])
 
 
 class _Voxels(NamedTuple):

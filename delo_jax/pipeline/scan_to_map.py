@@ -10,22 +10,23 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from delo_jax import inference
+from delo_jax.config import require
 from delo_jax.errors import ConfigError
 from delo_jax.geometry import se3
+from delo_jax.geometry.point_to_plane import RobustFit, SweepFit
 from delo_jax.inference import Estimate, PreparedScan
 from delo_jax.model.delo import Model, Surfaces
-from delo_jax.pipeline.local_map import LocalMap
+from delo_jax.pipeline.local_map import CROP_M, LocalMap, surfaces_of
 from delo_jax.uncertainty import covariance, status
 from delo_jax.uncertainty.observability import observability
 
-CROP_M = 60.0  # of the map around the predicted pose
 NUM_LEARNED_POINTS, NUM_ROBUST_POINTS = 512, 2048
-STEPS_PER_ROUND = 2  # robust steps between two searches for matches
+ROBUST_STEPS, SWEEP_STEPS = 4, 2  # between two searches for matches
 SCALE_M, REACH_M = 0.1, 0.8
 SWEEP_OPTIONS: dict[str, Any] = {
     "scale_m": SCALE_M,
     "reach_m": REACH_M,
-    "num_steps": STEPS_PER_ROUND,
+    "num_steps": SWEEP_STEPS,
     "sigma_velocity": (0.5, 0.5),  # of that at the stamp, about the mean since the last scan [rad/s, m/s]
     "sigma_m": 0.002,  # of the mean plane distance of a scan
 }
@@ -46,10 +47,14 @@ class Steps:
 
     num_learned: int = 2
     """Learned steps from a prediction; where it may be far off, 12."""
-    num_robust: int = 4
-    """Classical steps after them; even."""
-    num_passes: int = 2
-    """2: de-skewed with the predicted velocity, and once more with the one found; 1: not again."""
+    num_rounds: int = 1
+    """Searches for matches after them, each with four classical steps."""
+    deskew_again: bool = True
+    """After the solve, solve once more with the velocity of the sweep free, where points carry times."""
+
+    def __post_init__(self):
+        for name in ("num_learned", "num_rounds"):
+            require(getattr(self, name) >= 0, f"steps.{name}", "0 or more", getattr(self, name))
 
 
 class MapFix(NamedTuple):
@@ -59,6 +64,9 @@ class MapFix(NamedTuple):
     score: float  # mean robust weight of the scan's points, in [0, 1]
     rms_m: float  # weighted distance to the surfaces
     information: np.ndarray  # (6, 6), right perturbation, per unit of weight
+
+
+NOWHERE = MapFix(np.eye(4), 0.0, np.inf, np.zeros((6, 6)))
 
 
 class SweepFix(NamedTuple):
@@ -74,6 +82,7 @@ class Located(NamedTuple):
 
     motion: Estimate  # T_since_current
     scan: PreparedScan  # as it was registered: de-skewed with this motion
+    score: float  # as of its fix
 
 
 class Surroundings:
@@ -95,9 +104,9 @@ class Surroundings:
 
 
 def register(
-    params: Model, scan: PreparedScan, near: Surroundings, T_start_init: np.ndarray, *, num_learned: int, num_robust: int, skip: int = 0
+    params: Model, scan: PreparedScan, near: Surroundings, T_start_init: np.ndarray, *, num_learned: int, num_rounds: int, skip: int = 0
 ) -> MapFix:
-    """Pose of a scan near a start; score 0 where there is no map.
+    """Pose of a scan near a start; score 0 where there is no map, or no number comes out.
 
     Args:
         params: weights.
@@ -105,25 +114,33 @@ def register(
         near: the map around the start.
         T_start_init: (4, 4) where to begin.
         num_learned: steps of the fine stage, on 512 points.
-        num_robust: classical steps after them, on 2048 points.
+        num_rounds: searches for matches after them, each with four classical steps on 2048 points.
         skip: points that the learned steps leave out: another subset is another chance.
     """
-    nowhere = MapFix(np.eye(4), 0.0, np.inf, np.zeros((6, 6)))
-    if not near.usable:
-        return nowhere
     T = T_start_init.astype(np.float32)
+    if not near.usable:
+        return NOWHERE
     first = min(skip, max(scan.num_points - NUM_LEARNED_POINTS, 0))
-    source = surfaces_of(scan, slice(first, first + NUM_LEARNED_POINTS))
+    source = surfaces_of(scan.scan, slice(first, first + NUM_LEARNED_POINTS))
     for _ in range(num_learned):
         T = np.asarray(inference.fine_step(params, source, near.matches(source, T), T))
-    source = surfaces_of(scan, slice(0, NUM_ROBUST_POINTS))
-    for num_steps in [STEPS_PER_ROUND] * (num_robust // STEPS_PER_ROUND) or [0]:
+        if not np.isfinite(T).all():
+            return NOWHERE
+    source, fix = surfaces_of(scan.scan, slice(0, NUM_ROBUST_POINTS)), NOWHERE
+    for num_steps in [ROBUST_STEPS] * num_rounds or [0]:
         fit = _robust(source, near.matches(source, T), T, num_steps)
-        T = fit.T_target_source
+        fix, T = _fix_of(fit), np.asarray(fit.T_target_source)
+        if fix is NOWHERE:
+            break
+    return fix
+
+
+def _fix_of(fit: RobustFit | SweepFit) -> MapFix:
+    """On the host, orthonormal to float64; nowhere when it is not a number."""
+    T = np.asarray(fit.T_target_source, np.float64)
     if not (np.isfinite(T).all() and np.isfinite(fit.information).all()):
-        return nowhere
-    T_start_lidar = se3.exp(se3.log(T.astype(np.float64)))  # orthonormal to float64
-    return MapFix(T_start_lidar, float(fit.score), float(fit.rms_m), np.asarray(fit.information, np.float64))
+        return NOWHERE
+    return MapFix(se3.exp(se3.log(T)), float(fit.score), float(fit.rms_m), np.asarray(fit.information, np.float64))
 
 
 def register_sweep(scan: PreparedScan, near: Surroundings, fix: MapFix, velocity: np.ndarray) -> SweepFix:
@@ -140,41 +157,47 @@ def register_sweep(scan: PreparedScan, near: Surroundings, fix: MapFix, velocity
     for _ in range(MAX_ROUNDS):
         scan = scan.still(found)
         fit = _sweep(scan, times_s, near, fix.T_start_lidar.astype(np.float32), velocity - found)
-        if not (np.isfinite(fit.T_target_source).all() and np.isfinite(fit.velocity).all()):
+        refined = _fix_of(fit)
+        if refined is NOWHERE or not np.isfinite(fit.velocity).all():
             break
-        found = found + fit.velocity
-        T_start_lidar = se3.exp(se3.log(fit.T_target_source.astype(np.float64)))
-        fix = MapFix(T_start_lidar, float(fit.score), float(fit.rms_m), np.asarray(fit.information, np.float64))
+        fix, found = refined, found + fit.velocity
         if np.all(np.abs(fit.velocity) < SETTLED):
             break
     return SweepFix(fix, scan.still(found), found - velocity)
 
 
-def _sweep(scan: PreparedScan, times_s: np.ndarray, near: Surroundings, T: np.ndarray, velocity_prior: np.ndarray):
-    source = surfaces_of(scan, slice(0, NUM_ROBUST_POINTS))
+def _sweep(scan: PreparedScan, times_s: np.ndarray, near: Surroundings, T: np.ndarray, velocity_prior: np.ndarray) -> SweepFit:
+    source = surfaces_of(scan.scan, slice(0, NUM_ROBUST_POINTS))
     matched = near.matches(source, T)
     rows = source.points, source.normals, source.mask, times_s, matched.points, matched.normals
     return jax.device_get(inference.sweep_steps(*rows, T, velocity_prior.astype(np.float32), **SWEEP_OPTIONS))
 
 
-def _robust(source: Surfaces, matched: Surfaces, T: np.ndarray, num_steps: int):
+def _robust(source: Surfaces, matched: Surfaces, T: np.ndarray, num_steps: int) -> RobustFit:
     rows = source.points, source.normals, source.mask, matched.points, matched.normals
     return jax.device_get(inference.robust_steps(*rows, T, scale_m=SCALE_M, reach_m=REACH_M, num_steps=num_steps))
 
 
-def surfaces_of(scan: PreparedScan, rows: slice = slice(None)) -> Surfaces:
-    """What a scan shows."""
-    found = scan.scan
-    return Surfaces(found.points[rows], found.normals[rows], found.features[rows], found.mask[rows])
+def require_fine_stage(params: Model) -> None:
+    """Raise where the network cannot register to a map."""
+    if params.cfg.fine.num_iters == 0:
+        name = params.cfg.name
+        what = f"expected a network with a fine stage, got preset {name!r}, which has none; go without a map: use_map=False, --map none"
+        raise ConfigError(f"map: {what}")
 
 
 def compile_steps(params: Model) -> None:
-    """Compiles what `register` calls: shapes are fixed, so surfaces that show nothing do."""
+    """Compiles what `register` calls: shapes are fixed, so surfaces that show nothing do.
+
+    Raises:
+        ConfigError: a network without a fine stage.
+    """
+    require_fine_stage(params)
     nothing = inference.prepare(params, np.zeros((0, 3), np.float32))
-    few, many = (surfaces_of(nothing, slice(0, num)) for num in (NUM_LEARNED_POINTS, NUM_ROBUST_POINTS))
+    few, many = (surfaces_of(nothing.scan, slice(0, num)) for num in (NUM_LEARNED_POINTS, NUM_ROBUST_POINTS))
     identity = np.eye(4, dtype=np.float32)
     jax.block_until_ready(inference.fine_step(params, few, few, identity))
-    _robust(many, many, identity, STEPS_PER_ROUND)
+    _robust(many, many, identity, ROBUST_STEPS)
     rows = many.points, many.normals, many.mask, np.zeros(len(many.points), np.float32), many.points, many.normals
     jax.block_until_ready(inference.sweep_steps(*rows, identity, np.zeros(6, np.float32), **SWEEP_OPTIONS))
 
@@ -183,11 +206,7 @@ class MapTracker:
     """The local map of a drive, how well scans have fitted it lately, and what that says of the next one."""
 
     def __init__(self, params: Model, steps: Steps):
-        if params.cfg.fine.num_iters == 0:
-            raise ConfigError(
-                f"map: expected a network with a fine stage, got preset {params.cfg.name!r}, which has none; "
-                "go without a map: use_map=False, --map none"
-            )
+        require_fine_stage(params)
         self._params, self._steps, self._map = params, steps, LocalMap()
         self._scores: deque[float] = deque(maxlen=NUM_RECENT)
         self._inserted_at: np.ndarray | None = None
@@ -204,7 +223,7 @@ class MapTracker:
             moved = se3.inverse(self._inserted_at) @ T_world_lidar
             if np.linalg.norm(moved[:3, 3]) < INSERT_M and se3.rotation_angle(moved[:3, :3]) < np.radians(INSERT_DEG):
                 return
-        self._map.insert(surfaces_of(scan), T_world_lidar)
+        self._map.insert(surfaces_of(scan.scan), T_world_lidar)
         self._map.prune(T_world_lidar)
         self._inserted_at = T_world_lidar
 
@@ -221,15 +240,16 @@ class MapTracker:
             recovering: the guesses may be far off: more learned steps, from two subsets of the scan's points.
         """
         num_learned = RECOVERY_STEPS if recovering and self._steps.num_learned else self._steps.num_learned
+        skips = (0, NUM_LEARNED_POINTS) if recovering and num_learned else (0,)
         tries = []
         for T_since_guess in Ts_since_guess:
             near = Surroundings(self._map, T_world_since @ T_since_guess)
-            for skip in (0, NUM_LEARNED_POINTS) if recovering else (0,):
-                steps = {"num_learned": num_learned, "num_robust": self._steps.num_robust, "skip": skip}
+            for skip in skips:
+                steps = {"num_learned": num_learned, "num_rounds": self._steps.num_rounds, "skip": skip}
                 tries.append((register(self._params, scan, near, np.eye(4), **steps), T_since_guess, near))
         fix, T_since_guess, near = max(tries, key=lambda one: one[0].score)
         change = np.zeros(6)
-        if self._steps.num_passes > 1 and scan.times_s is not None and fix.score > 0.0:
+        if self._steps.deskew_again and scan.times_s is not None and fix.score > 0.0:
             motions = [T_since_guess @ fix.T_start_lidar, *(Ts_since_guess if recovering else ())]
             sweeps = [register_sweep(scan, near, fix, se3.log(T) / elapsed_s) for T in motions]
             fix, scan, change = max(sweeps, key=lambda sweep: sweep.fix.score)
@@ -237,7 +257,13 @@ class MapTracker:
         if motion.status == "ok" and np.any(np.abs(change) > UNSTEADY):
             what = f"{np.degrees(np.abs(change[:3]).max()):.0f} deg/s and {np.abs(change[3:]).max():.1f} m/s"
             motion = dataclasses.replace(motion, status="low_confidence", reason=f"the velocity changed by {what} since the last scan")
-        return Located(motion, scan)
+        return Located(motion, scan, fix.score)
+
+    def accept(self, located: Located) -> Estimate:
+        """The motion of a scan that stands; its score is one of the usual from now on."""
+        if located.motion.status != "rejected":
+            self._scores.append(located.score)
+        return located.motion
 
     def _judged(self, scan: PreparedScan, fix: MapFix, T_expected: np.ndarray, T_since_guess: np.ndarray) -> Estimate:
         """Motion, covariance and status of a fix."""
@@ -251,7 +277,6 @@ class MapTracker:
         if health.status != "rejected":
             T = T_since_guess @ fix.T_start_lidar
             known = covariance.from_information(fix.information, sigma_m=SIGMA_M + fix.rms_m, num_planes=fix.score * NUM_INDEPENDENT)
-            self._scores.append(fix.score)
         if health.status == "degenerate":
             known = covariance.widen(known, seen, cfg)
         return Estimate(T_target_source=T, **known._asdict(), status=health.status, confidence=health.confidence, reason=health.reason)

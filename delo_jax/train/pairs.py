@@ -6,14 +6,13 @@ import numpy as np
 from delo_jax.config import TrainConfig
 from delo_jax.geometry import se3
 from delo_jax.model.delo import Surfaces
-from delo_jax.pipeline.local_map import LocalMap
+from delo_jax.pipeline.local_map import CROP_M, LocalMap, surfaces_of
 from delo_jax.preprocess import Scan
 from delo_jax.train.step import PairBatch
 from delo_jax.train.worlds import World
 
 MAX_IDENTITY_START_M = 2.5  # farther than this the identity is no start for a local method
 MAP_FRAMES = 2, 5  # frames in a local map
-MAP_REACH_M = 60.0
 MAP_POSE_SIGMA = np.repeat([np.radians(0.05), 0.01], 3)  # of the frames in a map: an odometry is never exact
 WIDE_SHARE = 0.55  # of the predictions on a map, off by as much as after an outage; the others as in a stream
 WIDE_M, WIDE_DEG = 3.5, 17.0
@@ -81,17 +80,12 @@ def _map_around(world: World, frame: int, T_predicted_source: np.ndarray, cfg: T
     local_map = LocalMap()
     for other in np.sort(rng.permutation(others)[:num]):
         local_map.insert(
-            _surfaces_of(Scan(*(array[other] for array in world.scans))),
+            surfaces_of(Scan(*(array[other] for array in world.scans))),
             world.Ts_world_lidar[other] @ se3.exp(MAP_POSE_SIGMA * rng.normal(size=6)),
         )
-    seen = local_map.crop(world.Ts_world_lidar[frame] @ se3.inverse(T_predicted_source), MAP_REACH_M)
+    seen = local_map.crop(world.Ts_world_lidar[frame] @ se3.inverse(T_predicted_source), CROP_M)
     nearest = np.argsort(np.einsum("ij,ij->i", seen.points, seen.points), kind="stable")[: cfg.num_map_points]
     return Surfaces(*(array[nearest] for array in seen))
-
-
-def _surfaces_of(scan: Scan) -> Surfaces:
-    """What a scan shows, its padding included."""
-    return Surfaces(scan.points, scan.normals, scan.features, scan.mask)
 
 
 def _padded(seen: Surfaces, num: int) -> Surfaces:
@@ -134,7 +128,7 @@ def random_pair(world: World, cfg: TrainConfig, rng: np.random.Generator, *, evi
 def _with_surfaces(scans: list[Scan], T_true, T_init, *, from_coarse: bool, cfg: TrainConfig, evidence: bool) -> PairBatch:
     """A pair whose fine stage, where it is trained, aligns the source with the target."""
     used = cfg.fine_weight > 0 and not evidence
-    target = _surfaces_of(scans[1])
+    target = surfaces_of(scans[1])
     surfaces = _padded(target, cfg.num_map_points) if used else Surfaces(*(array[:0] for array in target))
     T_true, T_init = T_true.astype(np.float32), T_init.astype(np.float32)
     return PairBatch(scans[0], scans[1], T_true, T_init, np.array(from_coarse), surfaces, T_true, T_init)
