@@ -28,13 +28,14 @@ class Estimate:
     """Pose of a pair with its uncertainty and health.
 
     Variances and the covariance are those of `T_target_source` under a right perturbation, order [omega, v], rad and m.
-    They are the evidence head's own, not calibrated; a preset without one says that it knows nothing.
+    Not calibrated: those of a pair are the evidence head's own (a preset without one says that it knows nothing), those of a scan
+    on a map come from the information matrix of its last solve.
     """
 
     T_target_source: np.ndarray
     """(4, 4) float64: maps source points into the target frame."""
     covariance: np.ndarray
-    """(6, 6); also holds the square of the head's expected error, which is not applied to the pose."""
+    """(6, 6); of a pair it also holds the square of the head's expected error, which is not applied to the pose."""
     aleatoric: np.ndarray
     """(6,) variances: noise of the data."""
     epistemic: np.ndarray
@@ -42,7 +43,8 @@ class Estimate:
     status: str
     """ok, low_confidence, degenerate or rejected."""
     confidence: float
-    """Probability in [0, 1] that the pair is not lost; with the paper's evidence head its 1 - Var[mu], which is none."""
+    """In [0, 1]: the probability that a pair is not lost; with the paper's evidence head its 1 - Var[mu], which is none; of a scan
+    on a map, how well it fits beside what is usual there."""
     reason: str
     """Why the status is not ok; empty when it is."""
 
@@ -73,7 +75,7 @@ class Estimate:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class PreparedScan:
-    """A preprocessed scan; encoded when the network first asks for it, and never twice."""
+    """A preprocessed scan; encoded when the network first asks for it, once for each de-skew."""
 
     params: delo.Model
     scan: Scan

@@ -244,6 +244,17 @@ def test_still_scan_is_the_scan_of_a_sensor_at_rest():
     np.testing.assert_array_equal(found.features, scan.features)
 
 
+def test_padding_does_not_widen_a_sweep():
+    """Oracle: scipy's expm; times about a second before the stamp, a scan that is not full, 40 m/s: 2 cm between two instants."""
+    points = street.scan(street.pose(), noise_m=0.01).points
+    scan, times_s = preprocess_timed(points, -0.9 + 0.05 * np.sin(np.arange(len(points))), CFG)
+    assert not scan.mask.all()
+    velocity = np.array([0.0, 0.0, 0.0, 40.0, 0.0, 0.0])
+    found = still(scan, times_s, velocity)
+    moved = scan.points[scan.mask] + times_s[scan.mask, None] * velocity[None, 3:]
+    assert np.abs(found.points[scan.mask] - moved).max() < 0.02
+
+
 def test_a_dense_scan_is_thinned_evenly():
     """Oracle: the same scan without the rows that are left out."""
     points = street.scan(street.pose(), noise_m=0.01).points

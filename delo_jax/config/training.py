@@ -37,7 +37,7 @@ class TrainConfig:
     num_points: int = 512
     """Source points of the fine stage in training."""
     map_share: float = 0.6
-    """Share of the pairs whose fine stage learns against a local map of 2 to 5 frames rather than one scan."""
+    """Share of the augmented pairs whose fine stage learns against a local map of 2 to 5 frames rather than one scan."""
     num_map_points: int = 4096
     """Surfaces of such a map, the nearest ones, at most; no fewer than a scan has points."""
     num_iters: int = 4

@@ -29,9 +29,8 @@ class PairBatch(NamedTuple):
     T_target_source: Float[Array, "b 4 4"]  # truth
     T_init: Float[Array, "b 4 4"]  # start of the fine stage
     from_coarse: Bool[Array, " b"]  # start from the coarse stage's own output instead
-    surfaces: (
-        delo.Surfaces
-    )  # target of the fine stage: the target scan, or a local map around it; without rows where there is no fine stage
+    # target of the fine stage: the target scan, or a local map around the source; without rows where there is no fine stage
+    surfaces: delo.Surfaces
     T_surfaces_source: Float[Array, "b 4 4"]  # truth
     T_surfaces_init: Float[Array, "b 4 4"]  # start of the fine stage there
 

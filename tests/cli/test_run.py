@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from delo_jax import weights
 from delo_jax.data.sequence import Dataset
+from tests.fixtures import narrow_model
 
 NUM_SCANS, NAME = 8, "mixed-50"  # of the tree
 CALIBRATION = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]])  # that the tree is written with
@@ -93,6 +95,16 @@ def test_run_with_and_without_a_map(tree, cli, tmp_path, options, kind):
     true = read_rows(tree / "poses" / f"{NAME}.txt")
     found = read_rows(tmp_path / "out" / "poses_kitti.txt")
     assert np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1).max() < 0.05
+
+
+def test_a_network_without_a_fine_stage_needs_no_map(tree, cli, tmp_path):
+    """Oracle: exit code and sentence; with --map none the same weights run."""
+    file = weights.save(tmp_path / "paper", narrow_model("paper"), {"name": "paper"})
+    done = cli("run", tree, "--weights", str(file), "--out", tmp_path / "out")
+    assert done.code == 2
+    assert "expected a network with a fine stage" in done.err
+    assert "--map none" in done.err
+    assert cli("run", tree, "--weights", str(file), "--map", "none", "--out", tmp_path / "out").code == 0
 
 
 def test_same_bytes_twice_in_numbered_folders(folder, tree, cli, monkeypatch, tmp_path):

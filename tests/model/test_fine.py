@@ -116,9 +116,9 @@ def test_perfect_planes_give_the_motion():
     assert after[1] < 0.02
 
 
-@pytest.mark.parametrize("pair", ["street", "simulated"])
-def test_untrained_network_already_registers(pair):
-    """Oracle: analytic street and simulator truth. Random confidences still weigh right planes: a decimetre from 16 beams."""
+@pytest.mark.parametrize(("pair", "bound_m"), [("street", 0.1), ("simulated", 0.15)])
+def test_untrained_network_already_registers(pair, bound_m):
+    """Oracle: analytic street and simulator truth. Random confidences still weigh right planes: a decimetre, 16 beams a little more."""
     if pair == "street":
         clouds, T_true = [street_points(0), street_points(1)], T_street()
     else:
@@ -131,7 +131,7 @@ def test_untrained_network_already_registers(pair):
         T = refine_tiny(tiny_model(), *clouds, T)[-1]
     assert errors(np.eye(4), T_true)[0] > 0.3
     translation, rotation = errors(T, T_true)
-    assert translation < 0.15
+    assert translation < bound_m
     assert rotation < 0.5
 
 

@@ -1,7 +1,9 @@
 """Scan to map, with the released weights, on streets known exactly."""
 
+import dataclasses
 import functools
 
+import jax
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -10,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import delo_jax
 from delo_jax import inference
 from delo_jax.errors import ConfigError
+from delo_jax.inference import Estimate
 from delo_jax.pipeline.lidar_odometry import LidarOdometry
 from delo_jax.pipeline.local_map import LocalMap, surfaces_of
 from delo_jax.pipeline.scan_to_map import MapTracker, Steps, Surroundings, register
@@ -225,3 +228,71 @@ def test_network_stands_where_the_map_does_not_fit():
     assert frames[4].motion.reason.startswith("the map does not fit (confidence 0.")
     for k in (4, 5, 6):
         assert errors(frames[k].T_world_lidar, np.linalg.inv(pose_at(0)) @ pose_at(k))[0] < 0.15
+
+
+def test_two_bad_scans_do_not_cost_the_map():
+    """Oracle: the truth; scans of noise, one after the other, take over nothing: the next good scan is where it is."""
+    rng = np.random.default_rng(0)
+    noise = [rng.uniform([-40, -40, -2], [40, 40, 10], (20_000, 3)).astype(np.float32) for _ in range(2)]
+    frames = drive([*(sweep(k) for k in range(4)), *noise, sweep(6), sweep(7)])
+    assert [frame.status for frame in frames[4:6]] == ["rejected", "rejected"]
+    for frame, k in zip(frames[6:], (6, 7), strict=True):
+        assert (frame.status, frame.since) == ("ok", 3 if k == 6 else 6)
+        assert errors(frame.T_world_lidar, np.linalg.inv(pose_at(0)) @ pose_at(k))[0] < 0.1
+
+
+def test_unreadable_scan_on_the_map():
+    """Oracle: the truth; the scan after one that could not be read is measured across the gap."""
+    odometry = LidarOdometry(weights())
+    for k in range(4):
+        odometry.register(sweep(k))
+    assert odometry.reject("file is truncated").status == "rejected"
+    frame = odometry.register(sweep(5))
+    assert (frame.status, frame.since) == ("ok", 3)
+    assert errors(frame.T_world_lidar, np.linalg.inv(pose_at(0)) @ pose_at(5))[0] < 0.1
+
+
+def test_few_points_are_enough():
+    """Oracle: the truth; a scan of fewer points than the learned steps take, at a start 2 m and 10 deg off, which asks two subsets."""
+    points = sweep(5)
+    scan = inference.prepare(weights(), points[np.abs(np.arctan2(points[:, 1], points[:, 0])) < 0.4])
+    assert 100 < scan.num_points < 512
+    tracker = MapTracker(weights(), Steps())
+    tracker.restart(prepared(4), pose_at(4))
+    guess = np.linalg.inv(pose_at(4)) @ pose_at(5) @ street.pose(1.4, 1.4, 0.0, yaw_deg=10.0)
+    found = tracker.locate(scan, pose_at(4), [guess], 0.1, recovering=True).motion
+    assert errors(pose_at(4) @ found.T_target_source, pose_at(5))[0] < 0.1
+
+
+@pytest.mark.parametrize("name", ["fine_step", "robust_steps"])
+def test_no_number_no_pose(monkeypatch, name):
+    """Oracle: the status; a solve that breaks down in the middle of a drive is a rejected frame, not an exception."""
+    odometry = LidarOdometry(weights())
+    for k in range(3):
+        odometry.register(sweep(k))
+    function = getattr(inference, name)
+
+    def broken(*arguments, **options):
+        return jax.tree.map(lambda leaf: np.full_like(leaf, np.nan), jax.device_get(function(*arguments, **options)))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(inference, name, broken)
+        patch.setattr(
+            odometry, "_align", lambda params, source, target, start: dataclasses.replace(Estimate.exact(start), status="rejected")
+        )
+        assert odometry.register(sweep(3)).status == "rejected"
+    assert odometry.register(sweep(4)).status == "ok"
+
+
+def test_same_drive_same_bytes():
+    """Oracle: repetition."""
+    first, second = (drive([sweep(k) for k in (0, 1, 2, 5, 6)]) for _ in range(2))
+    assert all(a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes() for a, b in zip(first, second, strict=True))
+    assert all(a.covariance.tobytes() == b.covariance.tobytes() for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("options", [{"num_learned": -1}, {"num_rounds": -1}])
+def test_steps_are_counted_from_zero(options):
+    """Oracle: the sentence."""
+    with pytest.raises(ConfigError, match="steps.num_.*0 or more"):
+        Steps(**options)
