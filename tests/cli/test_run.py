@@ -99,7 +99,7 @@ def test_run_with_and_without_a_map(tree, cli, tmp_path, options, kind):
 
 def test_a_network_without_a_fine_stage_needs_no_map(tree, cli, tmp_path):
     """Oracle: exit code and sentence; with --map none the same weights run."""
-    file = weights.save(tmp_path / "paper", narrow_model("paper"), {"name": "paper"})
+    file = weights.save(tmp_path / "paper", narrow_model("paper", 128), {"name": "paper"})
     done = cli("run", tree, "--weights", str(file), "--out", tmp_path / "out")
     assert done.code == 2
     assert "expected a network with a fine stage" in done.err
