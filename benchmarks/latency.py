@@ -1,6 +1,6 @@
-"""Time of every stage of one scan-to-scan step, on full simulated HDL-64E scans; compilation apart.
+"""Time of every stage of one scan-to-scan step, and of a stream on its map, on full simulated HDL-64E scans; compilation apart.
 
-Run:     python benchmarks/latency.py [--quick]        (about a minute on 2 cores)
+Run:     python benchmarks/latency.py [--quick]        (about two minutes on 2 cores)
 
 Timings are medians and tails of single calls, results awaited, transfers to and from the device included. N source points are
 solved for, M target points are kept, K key points are matched.
@@ -20,7 +20,9 @@ from rich.progress import track
 
 import delo_jax
 from delo_jax import inference
+from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.sim import simulate_drive
+from delo_jax.sim.drive import DRIVE_SEED
 
 WARM_UP, NUM_SCANS = 20, 200
 
@@ -55,6 +57,27 @@ def measure(params, scans: list[np.ndarray], num_scans: int) -> dict[str, list[f
     return times
 
 
+def measure_stream(params, num_scans: int) -> dict[str, list[float]]:
+    """Milliseconds per stage and scan of `LidarOdometry`, on scans as measured; NaN where a scan is not taken into the map."""
+    odometry, names = delo_jax.LidarOdometry(params), ("prepare", "solve", "insert")
+    times: dict[str, list[float]] = {name: [] for name in (*names, "total")}
+    drive = simulate_drive("urban", DRIVE_SEED + 127, WARM_UP + num_scans, rolling_shutter=True)
+    for k, scan in enumerate(track(drive, "stream", total=WARM_UP + num_scans, console=Console(stderr=True))):
+        timing = odometry.register(scan.points, k * FRAME_PERIOD_NS, scan.times_s).timing
+        if k >= WARM_UP:
+            for name in names:
+                times[name].append(1e3 * timing.get(name, np.nan))
+            times["total"].append(1e3 * sum(timing.values()))
+    return times
+
+
+def show(title: str, times: dict[str, list[float]]) -> None:
+    """Percentiles of each stage."""
+    print(f"\n| {title} | p50 ms | p95 ms | p99 ms |\n|---|---:|---:|---:|")
+    for name, values in times.items():
+        print(f"| {name} | " + " | ".join(f"{value:.1f}" for value in np.nanpercentile(values, (50, 95, 99))) + " |")
+
+
 def main(argv: list[str] | None = None) -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -67,10 +90,9 @@ def main(argv: list[str] | None = None) -> int:
     times = measure(params, scans, 20 if args.quick else NUM_SCANS)
     cfg = params.cfg
     print(f"N = {cfg.fine.num_points}, M = {cfg.preprocess.max_points}, K = {cfg.preprocess.num_keypoints}; {len(scans[0])} points a scan")
-    print(f"JAX {jax.__version__} on {jax.devices()[0].device_kind}, delo-jax {version('delo-jax')}; first call {compiled:.1f} s\n")
-    print("| stage | p50 ms | p95 ms | p99 ms |\n|---|---:|---:|---:|")
-    for name, values in times.items():
-        print(f"| {name} | " + " | ".join(f"{value:.1f}" for value in np.percentile(values, (50, 95, 99))) + " |")
+    print(f"JAX {jax.__version__} on {jax.devices()[0].device_kind}, delo-jax {version('delo-jax')}; first call {compiled:.1f} s")
+    show("scan to scan", times)
+    show("stream on a map", measure_stream(params, 20 if args.quick else 110))
     return 0
 
 
