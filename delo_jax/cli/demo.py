@@ -55,6 +55,7 @@ class Demo(Command):
             facts={
                 "dataset": {"path": None, "sequence": None, "name": source.name, "layout": f"simulated, kind {KIND}, seed {SEED}"},
                 "sensor": {"elevation_correction_deg": 0.0, "motion_compensated": False, "point_times": "stored", "deskew": "done"},
+                "map": "local",
                 "truth": "truth.tum, exact",
             },
         )

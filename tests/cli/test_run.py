@@ -79,7 +79,7 @@ def test_what_the_run_says_of_itself(folder, tree, weights_file):
     assert facts["sensor"]["deskew"] == "none: the points carry no times"
     assert facts["poses_kitti_frame"] == "camera"
     assert "not calibrated" in facts["uncertainty"]
-    assert set(facts["timing_ms"]) == {"read", "prepare", "solve"}
+    assert set(facts["timing_ms"]) == {"read", "prepare", "solve", "insert"}
     options = tomllib.loads((folder / "config.toml").read_text())
     assert options["run"]["out"] == str(folder)
     assert options["model"]["preprocess"]["max_points"] == 3072
