@@ -1,6 +1,7 @@
 """Scan to local map: learned steps for the wide basin, robust classical steps for the last millimetres."""
 
 import dataclasses
+import itertools
 from collections import deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -244,15 +245,18 @@ class MapTracker:
         tries = []
         for T_since_guess in Ts_since_guess:
             near = Surroundings(self._map, T_world_since @ T_since_guess)
-            for skip in skips:
+            sweeps = [scan]
+            if recovering and scan.times_s is not None:  # a guess is a velocity too, unless the sensor was carried
+                sweeps.append(scan.still(se3.log(T_since_guess) / elapsed_s))
+            for sweep, skip in itertools.product(sweeps, skips):
                 steps = {"num_learned": num_learned, "num_rounds": self._steps.num_rounds, "skip": skip}
-                tries.append((register(self._params, scan, near, np.eye(4), **steps), T_since_guess, near))
+                tries.append((register(self._params, sweep, near, np.eye(4), **steps), T_since_guess, near))
         fix, T_since_guess, near = max(tries, key=lambda one: one[0].score)
         change = np.zeros(6)
         if self._steps.deskew_again and scan.times_s is not None and fix.score > 0.0:
             motions = [T_since_guess @ fix.T_start_lidar, *(Ts_since_guess if recovering else ())]
-            sweeps = [register_sweep(scan, near, fix, se3.log(T) / elapsed_s) for T in motions]
-            fix, scan, change = max(sweeps, key=lambda sweep: sweep.fix.score)
+            fixes = [register_sweep(scan, near, fix, se3.log(T) / elapsed_s) for T in motions]
+            fix, scan, change = max(fixes, key=lambda one: one.fix.score)
         motion = self._judged(scan, fix, Ts_since_guess[0], T_since_guess)
         if motion.status == "ok" and np.any(np.abs(change) > UNSTEADY):
             what = f"{np.degrees(np.abs(change[:3]).max()):.0f} deg/s and {np.abs(change[3:]).max():.1f} m/s"
