@@ -238,7 +238,8 @@ class MapTracker:
             T_world_since: pose that the motion starts from.
             Ts_since_guess: where to look; the one that the scan fits best from stands.
             elapsed_s: since then, for the velocity that the scan is de-skewed with again.
-            recovering: the guesses may be far off: more learned steps, from two subsets of the scan's points.
+            recovering: the guesses may be far off: more learned steps, from two subsets of the scan's points, each de-skewed as it is
+                and with the velocity of the guess.
         """
         num_learned = RECOVERY_STEPS if recovering and self._steps.num_learned else self._steps.num_learned
         skips = (0, NUM_LEARNED_POINTS) if recovering and num_learned else (0,)
@@ -250,8 +251,8 @@ class MapTracker:
                 sweeps.append(scan.still(se3.log(T_since_guess) / elapsed_s))
             for sweep, skip in itertools.product(sweeps, skips):
                 steps = {"num_learned": num_learned, "num_rounds": self._steps.num_rounds, "skip": skip}
-                tries.append((register(self._params, sweep, near, np.eye(4), **steps), T_since_guess, near))
-        fix, T_since_guess, near = max(tries, key=lambda one: one[0].score)
+                tries.append((register(self._params, sweep, near, np.eye(4), **steps), T_since_guess, near, sweep))
+        fix, T_since_guess, near, scan = max(tries, key=lambda one: one[0].score)
         change = np.zeros(6)
         if self._steps.deskew_again and scan.times_s is not None and fix.score > 0.0:
             motions = [T_since_guess @ fix.T_start_lidar, *(Ts_since_guess if recovering else ())]
