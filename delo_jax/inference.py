@@ -134,7 +134,7 @@ def align(params: delo.Model, source: PreparedScan, target: PreparedScan, T_targ
     T, known = start, covariance.unknown(limits)
     if health.status != "rejected":
         nig = [np.asarray(value, np.float64) for value in result.nig]
-        T = se3.exp(se3.log(np.asarray(result.T_target_source, np.float64)))
+        T = se3.orthonormal(np.asarray(result.T_target_source, np.float64))
         if head == "statistics":
             known = covariance.from_evidence(*nig)
         elif head == "embedding":

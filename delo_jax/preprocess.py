@@ -14,6 +14,7 @@ from delo_jax.geometry.normals import plane_fit
 
 MIN_NEIGHBORS = 5  # a plane through fewer points says nothing
 MAX_RADIUS_M = 1.5  # of a neighbourhood
+LEAF_SIZE = 24  # of the tree of neighbours
 HORIZONTAL = 0.85  # |n_z| above which a surface counts as ground-like
 
 
@@ -81,13 +82,16 @@ def preprocess_timed(points: np.ndarray, times_s: np.ndarray | None, cfg: Prepro
         ScanError: wrong shape or dtype.
     """
     points, rng = check_points(points), np.random.default_rng(0)  # the same scan gives the same bytes
-    columns = points if times_s is None else np.column_stack([points, np.nan_to_num(times_s, nan=0.0, posinf=0.0, neginf=0.0)])
+    stride = 1 if cfg.sampling == "raw" else max(1, -(-len(points) // cfg.max_raw_points))
+    columns = points.take(np.arange(0, len(points), stride), axis=0)
+    if times_s is not None:
+        columns = np.column_stack([columns, np.nan_to_num(times_s[::stride].astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)])
+    columns = _crop(columns, cfg)
     if cfg.sampling == "raw":
-        return _raw_scan(_crop(columns.astype(np.float32, copy=False), cfg), cfg, rng)
-    stride = max(1, -(-len(columns) // cfg.max_raw_points))
-    cloud = voxel_mean(_crop(columns[::stride].astype(np.float32, copy=False), cfg), cfg.voxel_m)
+        return _raw_scan(columns, cfg, rng)
+    cloud = voxel_mean(columns, cfg.voxel_m)
     rows = one_per_voxel(cloud, cfg.point_voxel_m, rng)[: 2 * cfg.max_points]
-    centers, normals, features, valid = _describe(cloud[:, :3], rows, cfg)
+    centers, normals, features, valid = _describe(np.ascontiguousarray(cloud[:, :3]), rows, cfg)
     kept = _select(normals, valid, cfg, rng)
     points, normals, features = centers[kept], normals[kept], features[kept]
     keypoints = _keypoints(points, normals, cfg, rng)
@@ -132,7 +136,6 @@ def _raw_scan(columns: np.ndarray, cfg: PreprocessConfig, rng: np.random.Generat
 
 def _crop(columns: np.ndarray, cfg: PreprocessConfig) -> np.ndarray:
     """Rows whose first three columns, a point, are in range."""
-    columns = np.ascontiguousarray(columns)
     with np.errstate(invalid="ignore", over="ignore"):
         x, y, z = columns[:, 0], columns[:, 1], columns[:, 2]
         squared_range = x * x + y * y + z * z
@@ -146,23 +149,39 @@ def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 
 
+def _by_voxel(points: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows in the order of their voxels, within one as they were, and the places where each voxel begins."""
+    row_bits = len(points).bit_length()
+    keys, key_bits = np.zeros(len(points), np.int64), 0
+    for column in points.T if len(points) else ():
+        cells = np.floor(column * np.float32(1.0 / size)).astype(np.int64)
+        low, high = int(cells.min()), int(cells.max())
+        bits = (high - low).bit_length()
+        keys, key_bits = (keys << bits) | (cells - low), key_bits + bits
+    if key_bits + row_bits < 64:  # key and row in one number: sorting numbers is several times faster than sorting rows by them
+        packed = np.sort((keys << row_bits) | np.arange(len(keys)))
+        rows, keys = packed & ((1 << row_bits) - 1), packed >> row_bits
+    else:
+        keys = voxel_keys(points, size)
+        rows = np.argsort(keys, kind="stable")
+        keys = keys[rows]
+    return rows, np.flatnonzero(np.r_[len(keys) > 0, keys[1:] != keys[:-1]])
+
+
 def voxel_mean(columns: np.ndarray, size: float) -> np.ndarray:
     """Mean of the rows in every occupied voxel, (v, c) float32; the first three columns are a point."""
     if len(columns) == 0:
         return columns
-    keys = voxel_keys(columns[:, :3], size)
-    order = np.argsort(keys, kind="stable")
-    keys = keys.take(order)
-    starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
-    counts = np.diff(np.r_[starts, len(keys)]).astype(np.float32)
-    return np.add.reduceat(columns.take(order, axis=0), starts, axis=0) / counts[:, None]
+    rows, starts = _by_voxel(columns[:, :3], size)
+    counts = np.diff(np.r_[starts, len(rows)]).astype(np.float32)
+    return np.add.reduceat(columns.take(rows, axis=0), starts, axis=0) / counts[:, None]
 
 
 def one_per_voxel(points: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
     """Row of one random point per occupied voxel, in random order."""
     order = rng.permutation(len(points))
-    _, first = np.unique(voxel_keys(points[order, :3], size), return_index=True)
-    return order[np.sort(first)]
+    places, starts = _by_voxel(points[order, :3], size)
+    return order[np.sort(places[starts])]
 
 
 def _describe(cloud: np.ndarray, rows: np.ndarray, cfg: PreprocessConfig):
@@ -172,11 +191,11 @@ def _describe(cloud: np.ndarray, rows: np.ndarray, cfg: PreprocessConfig):
     points = cloud[rows]
     ranges = np.linalg.norm(points, axis=1)
     radius = np.minimum(0.5 + 0.04 * ranges, MAX_RADIUS_M)
-    tree = cKDTree(cloud, balanced_tree=False, compact_nodes=False)
+    tree = cKDTree(cloud, leafsize=LEAF_SIZE, balanced_tree=False, compact_nodes=False)
     k = min(cfg.num_neighbors, len(cloud))
-    distances, index = tree.query(points, k=k, distance_upper_bound=MAX_RADIUS_M, workers=2)
+    distances, index = tree.query(points, k=k, distance_upper_bound=MAX_RADIUS_M)
     near = distances <= radius[:, None]
-    center, normal, eigenvalues = plane_fit(cloud[np.where(near, index, rows[:, None])], near)
+    center, normal, eigenvalues = plane_fit(cloud.take(np.where(near, index, rows[:, None]), axis=0), near)
     planar = eigenvalues[:, 0] < 0.1 * eigenvalues[:, 1]
     offset = np.einsum("ij,ij->i", points - center, normal)
     projected = points - np.where(planar, offset, 0.0)[:, None] * normal

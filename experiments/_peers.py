@@ -129,7 +129,7 @@ class _SmallGicp:
         elapsed_s, self._stamp_ns = (sweep.stamp_ns - self._stamp_ns) * NANOSECOND, sweep.stamp_ns
         motion = self._align(cloud, tree, self._motion.predict(elapsed_s))
         if motion is not None:
-            motion = se3.exp(se3.log(motion))  # orthonormal, or rounding grows from scan to scan
+            motion = se3.orthonormal(motion)  # or rounding grows from scan to scan
             self._T_world_lidar = self._T_world_lidar @ motion
             self._motion.update(motion, elapsed_s)
         self._keep(cloud, tree)

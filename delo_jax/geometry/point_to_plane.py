@@ -26,16 +26,32 @@ class PlaneStep(NamedTuple):
     """
 
 
+def _cross(a, b):
+    """Cross product of planar vectors (3, n): rows as long as the number of points keep a CPU's vector units busy."""
+    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _turned(T, vectors):
+    """Planar vectors in another frame."""
+    return T[:3, :1] * vectors[:1] + T[:3, 1:2] * vectors[1:2] + T[:3, 2:3] * vectors[2:]
+
+
+def _moved(T, points):
+    """Planar points in another frame."""
+    return _turned(T, points) + T[:3, 3:]
+
+
 @full_float32
 def _normal_equations(arms, errors, normals, plane, point):
-    """Hessian (6, 6) and gradient (6, 1) of half the objective, for the twist of points at `arms`."""
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=arms.dtype)[None], (*arms.shape, 3))
-    jacobians = jnp.concatenate([-se3.skew(arms), eye], axis=2)  # of the errors
-    rows = jnp.concatenate([jnp.cross(arms, normals), normals], axis=1)  # of the distances to the planes
-    distances = jnp.sum(normals * errors, axis=1, keepdims=True)
-    hessian = rows.T @ (plane * rows) + jnp.sum(jacobians.mT @ (point[:, :, None] * jacobians), axis=0)
-    gradient = rows.T @ (plane * distances) + jnp.sum(jacobians.mT @ (point * errors)[:, :, None], axis=0)
-    return hessian, gradient
+    """Hessian (6, 6) and gradient (6,) of half the objective, for the twist of planar points at `arms`; weights are (1, n)."""
+    rows = jnp.concatenate([_cross(arms, normals), normals])  # derivatives of the distances to the planes
+    distances = jnp.sum(normals * errors, axis=0, keepdims=True)
+    # The derivative of an error is J = [-[a]x, I]; the sums of J^T J and J^T e over points need their moments alone.
+    moment, first, mass = (point * arms) @ arms.T, jnp.sum(point * arms, axis=1), jnp.sum(point)
+    eye, cross = jnp.eye(3, dtype=arms.dtype), se3.skew(first)
+    at_points = jnp.block([[jnp.trace(moment) * eye - moment, cross], [cross.T, mass * eye]])
+    towards_points = jnp.sum(jnp.concatenate([_cross(arms, errors), errors]) * point, axis=1)
+    return (plane * rows) @ rows.T + at_points, jnp.sum(rows * (plane * distances), axis=1) + towards_points
 
 
 @full_float32
@@ -69,10 +85,14 @@ def point_to_plane_step(
     Returns:
         The step; the identity and a zero matrix when all weights are zero.
     """
+    return _planar_step(points.T, targets.T, normals.T, weights, tangential, damping)
+
+
+def _planar_step(points, targets, normals, weights, tangential, damping):
     total = jnp.sum(weights + tangential)
     safe_total = jnp.where(total > 0, total, 1.0)
-    plane, point = (weights / safe_total)[:, None], (tangential / safe_total)[:, None]
-    centre = jnp.sum((plane + point) * points, axis=0, keepdims=True)
+    plane, point = (weights / safe_total)[None], (tangential / safe_total)[None]
+    centre = jnp.sum((plane + point) * points, axis=1, keepdims=True)
     arms = points - centre
     radius2 = jnp.sum((plane + point) * arms * arms)
     radius = jnp.sqrt(jnp.where(radius2 > 0, radius2, 1.0))
@@ -81,11 +101,11 @@ def point_to_plane_step(
     eye = jnp.eye(6, dtype=points.dtype)
     ridge = damping + 64 * jnp.finfo(points.dtype).eps
     factor = jax.scipy.linalg.cho_factor(hessian + ridge * eye, lower=True)
-    step = -jax.scipy.linalg.cho_solve(factor, gradient)[:, 0]
+    step = -jax.scipy.linalg.cho_solve(factor, gradient)
 
     T_centred = se3.exp(jnp.concatenate([step[:3] / radius, step[3:]]))
-    shift = (centre - centre @ T_centred[:3, :3].T)[0]  # from the twist about the mean to the one about the origin
-    to_scaled = eye.at[:3, :3].mul(radius).at[3:, :3].set(-se3.skew(centre[0]))
+    shift = centre[:, 0] - T_centred[:3, :3] @ centre[:, 0]  # from the twist about the mean to the one about the origin
+    to_scaled = eye.at[:3, :3].mul(radius).at[3:, :3].set(-se3.skew(centre[:, 0]))
     return PlaneStep(T_centred.at[:3, 3].add(shift), total * (to_scaled.T @ hessian @ to_scaled))
 
 
@@ -130,31 +150,32 @@ def robust_point_to_plane(
         reach_m: a match farther apart than this is none [m].
         num_steps: static.
     """
-    no_tangential = jnp.zeros(points.shape[0], points.dtype)
+    points, normals, targets, target_normals = points.T, normals.T, targets.T, target_normals.T
+    no_tangential = jnp.zeros_like(points[0])
 
     def weigh(T):
-        moved = se3.transform(T, points)
-        return moved, *_robust_weights(moved, normals @ T[:3, :3].T, mask, targets, target_normals, scale_m, reach_m)
+        moved = _moved(T, points)
+        return moved, *_robust_weights(moved, _turned(T, normals), mask, targets, target_normals, scale_m, reach_m)
 
     def iterate(T, _):
         moved, weights, _ = weigh(T)
-        return point_to_plane_step(moved, targets, target_normals, weights, no_tangential, damping=0.0).T_delta @ T, None
+        return _planar_step(moved, targets, target_normals, weights, no_tangential, damping=0.0).T_delta @ T, None
 
     T, _ = jax.lax.scan(iterate, T_init, length=num_steps)
     moved, weights, distance = weigh(T)
     total = jnp.sum(weights) + 1e-9
-    information = point_to_plane_step(moved, targets, target_normals, weights, no_tangential, damping=0.0).information
+    information = _planar_step(moved, targets, target_normals, weights, no_tangential, damping=0.0).information
     Ad = se3.adjoint(T)
     rms = jnp.sqrt(jnp.sum(weights * distance**2) / total)
     return RobustFit(T, total / jnp.maximum(jnp.sum(mask.astype(points.dtype)), 1.0), rms, Ad.T @ information @ Ad / total)
 
 
 def _robust_weights(moved, turned, mask, targets, target_normals, scale_m, reach_m):
-    """Weight of each match, and its signed distance to the target's plane."""
+    """Weight of each match of planar points, and its signed distance to the target's plane."""
     offset = moved - targets
-    distance = jnp.sum(offset * target_normals, axis=1)
-    near = jnp.sum(offset * offset, axis=1) < reach_m**2
-    agrees = jnp.sum(turned * target_normals, axis=1) > 0.5**0.5
+    distance = jnp.sum(offset * target_normals, axis=0)
+    near = jnp.sum(offset * offset, axis=0) < reach_m**2
+    agrees = jnp.sum(turned * target_normals, axis=0) > 0.5**0.5
     return jnp.where(mask & near & agrees, (scale_m**2 / (scale_m**2 + distance**2)) ** 2, 0.0), distance
 
 
@@ -212,21 +233,23 @@ def robust_sweep_to_plane(
     scale = jnp.concatenate([lever, lever / SWEEP_S])
     pull = jnp.repeat((sigma_m / jnp.array(sigma_velocity, points.dtype)) ** 2, 3)
 
+    points, normals, targets, target_normals = points.T, normals.T, targets.T, target_normals.T
+
     def place(T, velocity):
-        swept = points + times_s[:, None] * (jnp.cross(velocity[None, :3], points) + velocity[None, 3:])
-        moved = se3.transform(T, swept)
-        weights, distance = _robust_weights(moved, normals @ T[:3, :3].T, mask, targets, target_normals, scale_m, reach_m)
-        direction = target_normals @ T[:3, :3]  # in the source frame
-        row = jnp.concatenate([jnp.cross(swept, direction), direction], axis=1)
-        rows = jnp.concatenate([row, times_s[:, None] * row], axis=1) * scale[None, :]
+        omega, v = velocity[:3, None], velocity[3:, None]
+        swept = points + times_s[None] * (_cross(omega, points) + v)
+        weights, distance = _robust_weights(_moved(T, swept), _turned(T, normals), mask, targets, target_normals, scale_m, reach_m)
+        direction = _turned(T.T, target_normals)  # in the source frame
+        row = jnp.concatenate([_cross(swept, direction), direction])
+        rows = jnp.concatenate([row, times_s[None] * row]) * scale[:, None]
         share = weights / (jnp.sum(weights) + 1e-9)
-        hessian = rows.T @ (share[:, None] * rows) + jnp.diag(jnp.concatenate([jnp.zeros(6), pull]) * scale**2)
+        hessian = (share[None] * rows) @ rows.T + jnp.diag(jnp.concatenate([jnp.zeros(6), pull]) * scale**2)
         return weights, distance, share, rows, hessian
 
     def iterate(state, _):
         T, velocity = state
         _, distance, share, rows, hessian = place(T, velocity)
-        gradient = rows.T @ (share * distance)
+        gradient = jnp.sum(rows * (share * distance)[None], axis=1)
         gradient = gradient.at[6:].add(pull * (velocity - velocity_prior) * scale[6:])
         factor = jax.scipy.linalg.cho_factor(hessian + 1e-6 * jnp.eye(12, dtype=points.dtype), lower=True)
         step = -scale * jax.scipy.linalg.cho_solve(factor, gradient)

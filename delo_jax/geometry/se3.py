@@ -125,6 +125,13 @@ def log(T: Float[AnyArray, "*b 4 4"]) -> Float[AnyArray, "*b 6"]:
 
 
 @full_float32
+def orthonormal(T: Float[AnyArray, "*b 4 4"]) -> Float[AnyArray, "*b 4 4"]:
+    """The pose with the rotation that is nearest to that of T, which rounding has left a little off."""
+    u, _, vt = _namespace(T).linalg.svd(T[..., :3, :3])
+    return _assemble(u @ vt, T[..., :3, 3])
+
+
+@full_float32
 def inverse(T: Float[AnyArray, "*b 4 4"]) -> Float[AnyArray, "*b 4 4"]:
     """T_a_b from T_b_a."""
     R_inverse = _namespace(T).swapaxes(T[..., :3, :3], -1, -2)

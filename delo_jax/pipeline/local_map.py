@@ -30,8 +30,8 @@ class _Voxels(NamedTuple):
     counts: np.ndarray  # (v,) float32, observations in the mean
 
     def rows(self, which: np.ndarray) -> "_Voxels":
-        """Those voxels."""
-        return _Voxels(*(array[which] for array in self))
+        """Those voxels: their numbers."""
+        return _Voxels(*(array.take(which, axis=0) for array in self))
 
     def merged(self, other: "_Voxels") -> "_Voxels":
         """These and others, which have other keys."""
@@ -67,8 +67,8 @@ class LocalMap:
             return
         at = np.minimum(np.searchsorted(self._voxels.keys, new.keys), len(self) - 1)
         known = self._voxels.keys[at] == new.keys
-        self._average(self._voxels, at[known], new.rows(known))
-        self._voxels = self._voxels.merged(new.rows(~known))
+        self._average(self._voxels, at[known], new.rows(np.flatnonzero(known)))
+        self._voxels = self._voxels.merged(new.rows(np.flatnonzero(~known)))
 
     def _observed(self, seen: Surfaces, T_world_lidar: np.ndarray) -> _Voxels:
         """A scan as voxels seen once."""
@@ -116,4 +116,4 @@ class LocalMap:
 
 def _near(voxels: _Voxels, T_world_lidar: np.ndarray, reach_m: float) -> np.ndarray:
     offset = voxels.points - T_world_lidar[:3, 3]
-    return np.einsum("ij,ij->i", offset, offset) < reach_m**2
+    return np.flatnonzero(np.einsum("ij,ij->i", offset, offset) < reach_m**2)

@@ -18,6 +18,7 @@ from delo_jax.geometry.point_to_plane import RobustFit, SweepFit
 from delo_jax.inference import Estimate, PreparedScan
 from delo_jax.model.delo import Model, Surfaces
 from delo_jax.pipeline.local_map import CROP_M, LocalMap, surfaces_of
+from delo_jax.preprocess import LEAF_SIZE
 from delo_jax.uncertainty import covariance, status
 from delo_jax.uncertainty.observability import observability
 
@@ -96,12 +97,12 @@ class Surroundings:
     def __init__(self, local_map: LocalMap, T_world_start: np.ndarray):
         self._seen = local_map.crop(T_world_start, CROP_M)
         self.usable = len(self._seen.points) >= MIN_TARGETS
-        self._tree = cKDTree(self._seen.points, balanced_tree=False, compact_nodes=False)
+        self._tree = cKDTree(self._seen.points, leafsize=LEAF_SIZE, balanced_tree=False, compact_nodes=False)
 
-    def matches(self, source: Surfaces, T: np.ndarray) -> Surfaces:
-        """The nearest surface to each of n points at T_start_lidar; there must be one."""
-        index = self._tree.query(np.asarray(source.points) @ T[:3, :3].T + T[:3, 3])[1]
-        return Surfaces(*(array[index] for array in self._seen))
+    def matches(self, source: Surfaces, T: np.ndarray, within_m: float = np.inf) -> Surfaces:
+        """The nearest surface to each of n points at T_start_lidar; some other where none is within reach. The map must be usable."""
+        index = self._tree.query(np.asarray(source.points) @ T[:3, :3].T + T[:3, 3], distance_upper_bound=within_m)[1]
+        return Surfaces(*(array.take(index, axis=0, mode="clip") for array in self._seen))
 
 
 def register(
@@ -129,7 +130,7 @@ def register(
             return NOWHERE
     source, fix = surfaces_of(scan.scan, slice(0, NUM_ROBUST_POINTS)), NOWHERE
     for num_steps in [ROBUST_STEPS] * num_rounds or [0]:
-        fit = _robust(source, near.matches(source, T), T, num_steps)
+        fit = _robust(source, near.matches(source, T, REACH_M), T, num_steps)
         fix, T = _fix_of(fit), np.asarray(fit.T_target_source)
         if fix is NOWHERE:
             break
@@ -141,7 +142,7 @@ def _fix_of(fit: RobustFit | SweepFit) -> MapFix:
     T = np.asarray(fit.T_target_source, np.float64)
     if not (np.isfinite(T).all() and np.isfinite(fit.information).all()):
         return NOWHERE
-    return MapFix(se3.exp(se3.log(T)), float(fit.score), float(fit.rms_m), np.asarray(fit.information, np.float64))
+    return MapFix(se3.orthonormal(T), float(fit.score), float(fit.rms_m), np.asarray(fit.information, np.float64))
 
 
 def register_sweep(scan: PreparedScan, near: Surroundings, fix: MapFix, velocity: np.ndarray) -> SweepFix:
@@ -169,7 +170,7 @@ def register_sweep(scan: PreparedScan, near: Surroundings, fix: MapFix, velocity
 
 def _sweep(scan: PreparedScan, times_s: np.ndarray, near: Surroundings, T: np.ndarray, velocity_prior: np.ndarray) -> SweepFit:
     source = surfaces_of(scan.scan, slice(0, NUM_ROBUST_POINTS))
-    matched = near.matches(source, T)
+    matched = near.matches(source, T, REACH_M)
     rows = source.points, source.normals, source.mask, times_s, matched.points, matched.normals
     return jax.device_get(inference.sweep_steps(*rows, T, velocity_prior.astype(np.float32), **SWEEP_OPTIONS))
 

@@ -140,6 +140,18 @@ def test_group_operations(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_orthonormal_takes_rounding_out(seed):
+    """Oracle: the pose before it was disturbed; translation is left alone."""
+    T = random_pose(seed)
+    disturbed = T.copy()
+    disturbed[:3, :3] += 1e-6 * np.random.default_rng(seed).normal(size=(3, 3))
+    found = se3.orthonormal(disturbed)
+    np.testing.assert_allclose(found, T, atol=5e-6)
+    np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-14)
+    np.testing.assert_array_equal(found[:, 3], T[:, 3])
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_pose6_is_intrinsic_xyz(seed):
     """Oracle: scipy Rotation, upper-case "XYZ"."""
     T = random_pose(seed)
