@@ -82,10 +82,10 @@ def preprocess_timed(points: np.ndarray, times_s: np.ndarray | None, cfg: Prepro
         ScanError: wrong shape or dtype.
     """
     points, rng = check_points(points), np.random.default_rng(0)  # the same scan gives the same bytes
-    stride = 1 if cfg.sampling == "raw" else max(1, -(-len(points) // cfg.max_raw_points))
-    columns = points.take(np.arange(0, len(points), stride), axis=0)
+    rows = np.arange(len(points)) if cfg.sampling == "raw" else _thinned(len(points), cfg.max_raw_points, rng)
+    columns = points.take(rows, axis=0)
     if times_s is not None:
-        columns = np.column_stack([columns, np.nan_to_num(times_s[::stride].astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)])
+        columns = np.column_stack([columns, np.nan_to_num(times_s.take(rows).astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)])
     columns = _crop(columns, cfg)
     if cfg.sampling == "raw":
         return _raw_scan(columns, cfg, rng)
@@ -132,6 +132,16 @@ def _raw_scan(columns: np.ndarray, cfg: PreprocessConfig, rng: np.random.Generat
     nothing = np.zeros((0, 3), np.float32), np.zeros((0, NUM_FEATURES), np.float32)
     scan = Scan(_pad(kept[:, :3], cfg.max_points), *nothing, mask, np.arange(cfg.max_points, dtype=np.int32), mask)
     return scan, _pad(kept[:, 3], cfg.max_points) if kept.shape[1] > 3 else None
+
+
+def _thinned(num: int, most: int, rng: np.random.Generator) -> np.ndarray:
+    """At most so many of `num` rows: of every few that follow each other one at random.
+
+    An even step would drop whole rings of a scan whose rows run from ring to ring.
+    """
+    stride = max(1, -(-num // most))
+    starts = np.arange(0, num, stride)
+    return starts if stride == 1 else np.minimum(starts + rng.integers(stride, size=len(starts), dtype=np.uint16), num - 1)
 
 
 def _crop(columns: np.ndarray, cfg: PreprocessConfig) -> np.ndarray:

@@ -255,12 +255,30 @@ def test_padding_does_not_widen_a_sweep():
     assert np.abs(found.points[scan.mask] - moved).max() < 0.02
 
 
-def test_a_dense_scan_is_thinned_evenly():
-    """Oracle: the same scan without the rows that are left out."""
-    points = street.scan(street.pose(), noise_m=0.01).points
-    cfg = dataclasses.replace(CFG, max_raw_points=len(points) // 3 + 1)
-    for found, expected in zip(preprocess(points, cfg), preprocess(points[::3], CFG), strict=True):
-        np.testing.assert_array_equal(found, expected)
+def test_thinning_keeps_all_rings_whatever_the_order_of_the_rows():
+    """Oracle: the rings of the scan. Rows run along each ring, or, as a sensor fires, from ring to ring; a step of two would leave out
+    every other ring of the latter. The ground is seen as a ring each, which voxels of 10 cm keep apart."""
+    points = street.scan(street.pose(), boxes=[]).points
+    by_firing = points[np.argsort(np.round(np.arctan2(points[:, 1], points[:, 0]), 4), kind="stable")]
+    cfg = dataclasses.replace(CFG, max_raw_points=len(points) // 2, voxel_m=0.1, point_voxel_m=0.4)
+    radii = np.unique(np.round(np.hypot(points[:, 0], points[:, 1]), 1))
+    radii = radii[(radii > cfg.min_range_m) & (radii < 15)]
+    for rows in (points, by_firing):
+        scan = preprocess(rows, cfg)
+        kept = np.hypot(*scan.points[scan.mask, :2].T)
+        assert len(radii) > 5
+        assert np.abs(kept[None] - radii[:, None]).min(axis=1).max() < 0.1
+
+
+def test_thinning_keeps_the_times_of_the_points():
+    """Oracle: the time of a point is its azimuth here, whichever of the points are kept."""
+    points = street.scan(street.pose()).points
+    times_s = 0.1 * np.arctan2(points[:, 1], points[:, 0]) / np.pi
+    scan, kept_s = preprocess_timed(points, times_s, dataclasses.replace(CFG, max_raw_points=len(points) // 3))
+    assert kept_s is not None
+    x, y, _ = scan.points[scan.mask].T
+    off = np.angle(np.exp(1j * (np.pi * kept_s[scan.mask] / 0.1 - np.arctan2(y, x))))
+    assert np.abs(off[np.abs(np.arctan2(y, x)) < 3.0]).max() < 0.1  # two points of a voxel, on both sides of the cut, have no common time
 
 
 def cluttered(seed, reach_m):

@@ -33,7 +33,7 @@ class PreprocessConfig:
     max_range_m: float = 75.0
     """Points farther than this are dropped."""
     max_raw_points: int = 65_536
-    """Of a scan of more points, every second, third, ... one is used."""
+    """Of a scan of more points, one at random of every two, three, ... that follow each other is used."""
     voxel_m: float = 0.3
     """Voxel size of the cloud in which neighbours are sought."""
     point_voxel_m: float = 0.9

@@ -22,7 +22,7 @@ from delo_jax.preprocess import LEAF_SIZE
 from delo_jax.uncertainty import covariance, status
 from delo_jax.uncertainty.observability import observability
 
-NUM_LEARNED_POINTS, NUM_ROBUST_POINTS = 512, 2048
+NUM_LEARNED_POINTS = 512  # the robust steps take all
 ROBUST_STEPS, SWEEP_STEPS = 4, 2  # between two searches for matches
 SCALE_M, REACH_M = 0.1, 0.8
 SWEEP_OPTIONS: dict[str, Any] = {
@@ -116,7 +116,7 @@ def register(
         near: the map around the start.
         T_start_init: (4, 4) where to begin.
         num_learned: steps of the fine stage, on 512 points.
-        num_rounds: searches for matches after them, each with four classical steps on 2048 points.
+        num_rounds: searches for matches after them, each with four classical steps on all points.
         skip: points that the learned steps leave out: another subset is another chance.
     """
     T = T_start_init.astype(np.float32)
@@ -128,7 +128,7 @@ def register(
         T = np.asarray(inference.fine_step(params, source, near.matches(source, T), T))
         if not np.isfinite(T).all():
             return NOWHERE
-    source, fix = surfaces_of(scan.scan, slice(0, NUM_ROBUST_POINTS)), NOWHERE
+    source, fix = surfaces_of(scan.scan), NOWHERE
     for num_steps in [ROBUST_STEPS] * num_rounds or [0]:
         fit = _robust(source, near.matches(source, T, REACH_M), T, num_steps)
         fix, T = _fix_of(fit), np.asarray(fit.T_target_source)
@@ -154,11 +154,10 @@ def register_sweep(scan: PreparedScan, near: Surroundings, fix: MapFix, velocity
         fix: where it is, de-skewed with another velocity.
         velocity: (6,) expected, [omega rad/s, v m/s].
     """
-    times_s = np.asarray(scan.times_s)[:NUM_ROBUST_POINTS]
     found = velocity
     for _ in range(MAX_ROUNDS):
         scan = scan.still(found)
-        fit = _sweep(scan, times_s, near, fix.T_start_lidar.astype(np.float32), velocity - found)
+        fit = _sweep(scan, near, fix.T_start_lidar.astype(np.float32), velocity - found)
         refined = _fix_of(fit)
         if refined is NOWHERE or not np.isfinite(fit.velocity).all():
             break
@@ -168,10 +167,10 @@ def register_sweep(scan: PreparedScan, near: Surroundings, fix: MapFix, velocity
     return SweepFix(fix, scan.still(found), found - velocity)
 
 
-def _sweep(scan: PreparedScan, times_s: np.ndarray, near: Surroundings, T: np.ndarray, velocity_prior: np.ndarray) -> SweepFit:
-    source = surfaces_of(scan.scan, slice(0, NUM_ROBUST_POINTS))
+def _sweep(scan: PreparedScan, near: Surroundings, T: np.ndarray, velocity_prior: np.ndarray) -> SweepFit:
+    source = surfaces_of(scan.scan)
     matched = near.matches(source, T, REACH_M)
-    rows = source.points, source.normals, source.mask, times_s, matched.points, matched.normals
+    rows = source.points, source.normals, source.mask, scan.times_s, matched.points, matched.normals
     return jax.device_get(inference.sweep_steps(*rows, T, velocity_prior.astype(np.float32), **SWEEP_OPTIONS))
 
 
@@ -196,7 +195,7 @@ def compile_steps(params: Model) -> None:
     """
     require_fine_stage(params)
     nothing = inference.prepare(params, np.zeros((0, 3), np.float32))
-    few, many = (surfaces_of(nothing.scan, slice(0, num)) for num in (NUM_LEARNED_POINTS, NUM_ROBUST_POINTS))
+    few, many = surfaces_of(nothing.scan, slice(0, NUM_LEARNED_POINTS)), surfaces_of(nothing.scan)
     identity = np.eye(4, dtype=np.float32)
     jax.block_until_ready(inference.fine_step(params, few, few, identity))
     _robust(many, many, identity, ROBUST_STEPS)
