@@ -19,6 +19,7 @@ from delo_jax.uncertainty.observability import observability
 encode = jax.jit(delo.encode)
 solve = jax.jit(delo.solve)
 fine_step = jax.jit(delo.fine_step)
+covariance_half = jax.jit(delo.covariance_half)
 robust_steps = jax.jit(robust_point_to_plane, static_argnames=("scale_m", "reach_m", "num_steps"))
 sweep_steps = jax.jit(robust_sweep_to_plane, static_argnames=("scale_m", "reach_m", "num_steps", "sigma_velocity", "sigma_m"))
 
@@ -28,14 +29,14 @@ class Estimate:
     """Pose of a pair with its uncertainty and health.
 
     Variances and the covariance are those of `T_target_source` under a right perturbation, order [omega, v], rad and m.
-    Not calibrated: those of a pair are the evidence head's own (a preset without one says that it knows nothing), those of a scan
-    on a map come from the information matrix of its last solve.
+    Those of a pair are fitted by `delo calibrate`; of weights that are not calibrated they are the evidence head's own, and a preset
+    without one says that it knows nothing. Those of a scan on a map come from the information matrix of its last solve, not calibrated.
     """
 
     T_target_source: np.ndarray
     """(4, 4) float64: maps source points into the target frame."""
     covariance: np.ndarray
-    """(6, 6); of a pair it also holds the square of the head's expected error, which is not applied to the pose."""
+    """(6, 6); the evidence's own also holds the square of its expected error, which is not applied to the pose."""
     aleatoric: np.ndarray
     """(6,) variances: noise of the data."""
     epistemic: np.ndarray
@@ -135,7 +136,9 @@ def align(params: delo.Model, source: PreparedScan, target: PreparedScan, T_targ
     if health.status != "rejected":
         nig = [np.asarray(value, np.float64) for value in result.nig]
         T = se3.orthonormal(np.asarray(result.T_target_source, np.float64))
-        if head == "statistics":
+        if params.cfg.evidence.covariance_width:
+            known = covariance.from_half(np.asarray(covariance_half(params, result), np.float64), nig[1])
+        elif head == "statistics":
             known = covariance.from_evidence(*nig)
         elif head == "embedding":
             known = covariance.from_pose6_evidence(T, *nig)

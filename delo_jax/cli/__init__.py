@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import tyro
 
 import delo_jax
+from delo_jax.cli.calibrate import Calibrate
 from delo_jax.cli.command import Command
 from delo_jax.cli.demo import Demo
 from delo_jax.cli.doctor import Doctor
@@ -17,7 +18,15 @@ from delo_jax.cli.train import Train
 from delo_jax.config import to_toml
 from delo_jax.errors import DeloError
 
-COMMANDS: dict[str, type[Command]] = {"run": Run, "eval": Eval, "demo": Demo, "simulate": Simulate, "train": Train, "doctor": Doctor}
+COMMANDS: dict[str, type[Command]] = {
+    "run": Run,
+    "eval": Eval,
+    "demo": Demo,
+    "simulate": Simulate,
+    "train": Train,
+    "calibrate": Calibrate,
+    "doctor": Doctor,
+}
 FELL_SHORT, USAGE = 1, 2
 
 

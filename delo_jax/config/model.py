@@ -193,11 +193,15 @@ class EvidenceConfig:
     """Unit of the `statistics` head's rotation outputs."""
     translation_scale_m: float = 1e-2
     """Unit of the `statistics` head's translation outputs."""
+    covariance_width: int = 0
+    """Hidden channels of the covariance that `delo calibrate` fits on top of it; 0: there is none yet, the evidence stands as it is."""
 
     def __post_init__(self):
         require_one_of(self.head, "evidence.head", ("statistics", "embedding", "none"))
         require_one_of(self.embedding, "evidence.embedding", ("context", "encoder"))
         require_positive(self, "evidence.", "width", "rotation_scale_rad", "translation_scale_m")
+        fits = self.covariance_width == 0 or (self.covariance_width > 0 and self.head == "statistics")
+        require(fits, "evidence.covariance_width", "0, or more with the statistics head", self.covariance_width)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -17,8 +17,8 @@ from delo_jax.model import fine
 from delo_jax.model.attention import CloudContext
 from delo_jax.model.coarse import CoarsePose, coarse_pose
 from delo_jax.model.network import Network, example_inputs
-from delo_jax.model.statistics import consensus, statistics
-from delo_jax.ops import evidence
+from delo_jax.model.statistics import NUM_STATISTICS, consensus, statistics
+from delo_jax.ops import evidence, spread
 from delo_jax.ops.knn import knn
 
 T = TypeVar("T")
@@ -44,7 +44,8 @@ class Applicable(Protocol):
 class Model:
     """Weights and the config they belong to. Arrays are leaves, the config is static.
 
-    `variables` holds "params" and, where the preset has batch normalisation, its running statistics, "batch_stats".
+    `variables` holds "params", where the preset has batch normalisation its running statistics, "batch_stats", and once it is
+    calibrated the weights of `ops.spread`, "covariance".
     """
 
     variables: dict[str, Any]
@@ -137,7 +138,10 @@ class Registration(NamedTuple):
 
 def init(cfg: DeloConfig, key: Key[Array, ""]) -> Model:
     """Model with random weights, for training only."""
-    return Model(dict(Network(cfg).init(key, *example_inputs(cfg), method="everything")), cfg)
+    variables = dict(Network(cfg).init(key, *example_inputs(cfg), method="everything"))
+    if cfg.evidence.covariance_width:
+        variables["covariance"] = spread.init(NUM_STATISTICS + 7, cfg.evidence.covariance_width, key)
+    return Model(variables, cfg)
 
 
 def encode(model: Applicable, scan) -> Encoding:
@@ -272,6 +276,13 @@ def evidence_of_embedding(
     pooled = matching[:2] if model.cfg.evidence.embedding == "context" else (source.descriptors, target.descriptors)
     raw = model.apply("evidence", *pooled, source.keypoint_mask, target.keypoint_mask, se3.pose6(T))
     return evidence.constrain(raw, log_beta=False)
+
+
+def covariance_half(model: Model, result: Registration) -> Float[Array, "6 6"]:
+    """H with H H^T the covariance of a pair's pose, right perturbation; for a model that is calibrated."""
+    units = evidence_units(model.cfg)
+    said = spread.inputs(result.statistics, result.nig, result.confidence, units)
+    return spread.half(model.variables["covariance"], said, result.T_target_source, units)
 
 
 def evidence_units(cfg: DeloConfig) -> Float[Array, "6"]:

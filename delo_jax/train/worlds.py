@@ -17,8 +17,9 @@ from delo_jax.geometry import se3
 from delo_jax.preprocess import Scan, preprocess, preprocess_timed, still
 from delo_jax.sim import KINDS, SimulatedScan, simulate_clip
 
-SIMULATOR = 2  # counts the changes of `delo_jax.sim` and here that change a world; stored worlds of another are not used
+SIMULATOR = 3  # counts the changes of `delo_jax.sim`, `preprocess` and here that change a world; stored worlds of another are not used
 VALIDATION_SEED = 1_000_000  # of the first held-out world
+CALIBRATION_SEED = 1_200_000  # of the first world that covariances are fitted on
 SEEDS_PER_RUN = 2_000_000  # so that runs of different seeds share no world
 RAW_RESERVE = 4  # raw scans keep so many times the points of one input, of which training draws anew each time
 AS_MEASURED_SHARE = 1 / 3  # of the worlds: their scans are not de-skewed, as those of a single pair
@@ -94,21 +95,34 @@ def worlds(cfg: TrainConfig, folder: Path, *, validation: bool, on_world: Callab
         validation: the held-out worlds instead of the training worlds.
         on_world: called after each world, for progress.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     name, count, seed = ("validation", cfg.num_validation_scenes, VALIDATION_SEED) if validation else ("train", cfg.num_scenes, 0)
-    fingerprint = _fingerprint(cfg)
+    seed += cfg.seed * SEEDS_PER_RUN
+    yield from stored_worlds(folder, name, count, seed, num_frames=cfg.num_frames, cfg=cfg.model.preprocess, on_world=on_world)
+
+
+def stored_worlds(
+    folder: Path, name: str, count: int, seed: int, *, num_frames: int, cfg: PreprocessConfig, on_world: Callable[[], None] = lambda: None
+) -> Iterator[World]:
+    """Worlds `seed`, `seed + 1`, ..., read from `folder` or simulated and written there.
+
+    Args:
+        folder: store; may hold worlds of several names.
+        name: of these.
+        count: how many.
+        seed: of the first.
+        num_frames: scans of each.
+        cfg: preprocessing of the scans.
+        on_world: called after each world, for progress.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    text = json.dumps([SIMULATOR, asdict(stored_config(cfg)), num_frames, seed])
+    fingerprint = hashlib.sha256(text.encode()).hexdigest()[:8]
     for index in range(count):
         path = folder / f"{name}_{fingerprint}_{index:05d}.npz"
         if not path.exists():
-            world = make_world(index, seed=seed + cfg.seed * SEEDS_PER_RUN, num_frames=cfg.num_frames, cfg=cfg.model.preprocess)
-            write_world(path, world)
+            write_world(path, make_world(index, seed=seed, num_frames=num_frames, cfg=cfg))
         yield read_world(path)
         on_world()
-
-
-def _fingerprint(cfg: TrainConfig) -> str:
-    text = json.dumps([SIMULATOR, asdict(stored_config(cfg.model.preprocess)), cfg.num_frames, cfg.seed])
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 def write_world(path: Path, world: World) -> None:

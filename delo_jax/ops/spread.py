@@ -1,0 +1,91 @@
+"""A full covariance of a pose error from what a solver says of its own answer: a small network on numbers, as pure functions.
+
+The covariance is predicted in the frame of the motion, x along it and z up, as a Cholesky factor (Williams 1996): whichever way the
+sensor is turned, the answer turns with it.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from delo_jax.geometry.se3 import full_float32
+from delo_jax.ops.evidence import NIG, moments
+
+NUM_OUTPUTS = 21
+LARGEST_INPUT = 4.0  # standard deviations; beyond lies what the fit has not seen
+_ROWS, _COLUMNS = np.tril_indices(6)
+DIAGONAL = np.flatnonzero(_ROWS == _COLUMNS)  # outputs that are logarithms of the factor's diagonal
+_LARGEST_LOGIT = 8.0
+
+Weights = dict[str, jax.Array]
+
+
+def init(num_inputs: int, width: int, key: Key[Array, ""]) -> Weights:
+    """Weights that predict one unit on every axis, whatever goes in; mean and deviation of the inputs are to be filled in."""
+    return {
+        "mean": jnp.zeros(num_inputs),
+        "deviation": jnp.ones(num_inputs),
+        "hidden": jax.random.normal(key, (num_inputs, width)) / num_inputs**0.5,
+        "hidden_bias": jnp.zeros(width),
+        "out": jnp.zeros((width, NUM_OUTPUTS)),
+        "direct": jnp.zeros((num_inputs, NUM_OUTPUTS)),
+        "out_bias": jnp.zeros(NUM_OUTPUTS),
+    }
+
+
+def inputs(statistics: Float[Array, " s"], nig: NIG, confidence: Float[Array, ""], units: Float[Array, "6"]) -> Float[Array, " i"]:
+    """What the covariance is predicted from: the solver's statistics, the evidence's standard deviations and its odds of success."""
+    variances = sum(moments(nig)) / units**2
+    odds = jnp.log(confidence) - jnp.log1p(-confidence)
+    return jnp.concatenate([statistics, 0.5 * jnp.log(variances), jnp.clip(odds, -_LARGEST_LOGIT, _LARGEST_LOGIT)[None]])
+
+
+def factor(weights: Weights, said: Float[Array, " i"]) -> Float[Array, "6 6"]:
+    """Lower Cholesky factor of the covariance, in units and in the frame of the motion."""
+    x = jnp.clip((said - weights["mean"]) / weights["deviation"], -LARGEST_INPUT, LARGEST_INPUT)
+    hidden = jnp.tanh(x @ weights["hidden"] + weights["hidden_bias"])
+    raw = hidden @ weights["out"] + x @ weights["direct"] + weights["out_bias"]
+    lower = jnp.zeros((6, 6), raw.dtype).at[_ROWS, _COLUMNS].set(raw)
+    diagonal = jnp.exp(jnp.diagonal(lower))[:, None]
+    return diagonal * jnp.where(jnp.eye(6, dtype=bool), 1.0, lower)
+
+
+def motion_frame(T_target_source: Float[Array, "4 4"]) -> Float[Array, "6 6"]:
+    """Turns twists of the frame of the motion, x along its horizontal part, into the source frame; where nothing moves they are one."""
+    R, t = T_target_source[:3, :3], T_target_source[:3, 3]
+    x, y, _ = R.T @ t
+    length = jnp.sqrt(x * x + y * y)
+    moves = length > 1e-3
+    c, s = jnp.where(moves, x / jnp.where(moves, length, 1.0), 1.0), jnp.where(moves, y / jnp.where(moves, length, 1.0), 0.0)
+    zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+    Rz = jnp.stack([jnp.stack([c, -s, zero]), jnp.stack([s, c, zero]), jnp.stack([zero, zero, one])])
+    return jnp.block([[Rz, jnp.zeros_like(Rz)], [jnp.zeros_like(Rz), Rz]])
+
+
+@full_float32
+def half(weights: Weights, said: Float[Array, " i"], T_target_source: Float[Array, "4 4"], units: Float[Array, "6"]) -> Float[Array, "6 6"]:
+    """H with H H^T the covariance of a right perturbation of T_target_source, order [omega, v], rad and m.
+
+    Args:
+        weights: fitted.
+        said: from `inputs`.
+        T_target_source: the pose.
+        units: of the factor, (6,) [rad, m].
+    """
+    return motion_frame(T_target_source) @ (units[:, None] * factor(weights, said))
+
+
+@full_float32
+def negative_log_likelihood(
+    weights: Weights,
+    said: Float[Array, " i"],
+    T_target_source: Float[Array, "4 4"],
+    error: Float[Array, "6"],
+    units: Float[Array, "6"],
+) -> Float[Array, ""]:
+    """Minus the log density of an error of the pose [nats, up to a constant that the units set]."""
+    L = factor(weights, said)
+    turned = (motion_frame(T_target_source).T @ error) / units
+    white = jax.scipy.linalg.solve_triangular(L, turned, lower=True)
+    return 0.5 * jnp.sum(white**2) + jnp.sum(jnp.log(jnp.diagonal(L)))

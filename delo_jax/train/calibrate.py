@@ -1,0 +1,135 @@
+"""Covariances that fit the errors: pairs of worlds that no training has seen, and a small head fitted on them."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+from scipy.stats import norm
+
+from delo_jax import inference
+from delo_jax.geometry import se3
+from delo_jax.model import delo
+from delo_jax.ops import spread
+from delo_jax.ops.evidence import NIG
+from delo_jax.train.worlds import World, scan_of
+
+FRAMES = ((0, 1), (2, 3), (4, 5), (0, 2), (3, 5), (0, 3), (1, 4), (0, 5), (1, 0), (4, 2), (5, 2))  # (source, target) of a world's pairs
+NUM_FRAMES = 6
+WIDTH = 8
+WEIGHT_DECAY = 3e-3
+NUM_FOLDS = 4
+MAX_STEPS = 1000
+LEVELS = (0.68, 0.95)  # coverages between which the last scale of each axis is chosen
+
+
+class Pairs(NamedTuple):
+    """Solved pairs of worlds and what they got wrong, row by row."""
+
+    errors: np.ndarray  # (n, 6) float64: log(T_estimated^-1 T_true), [omega, v]
+    Ts_target_source: np.ndarray  # (n, 4, 4) estimated
+    statistics: np.ndarray  # (n, s)
+    nig: NIG  # arrays (n, 6)
+    confidence: np.ndarray  # (n,)
+    information: np.ndarray  # (n, 6, 6)
+    worlds: np.ndarray  # (n,) number of the world
+    gaps: np.ndarray  # (n,) frames from source to target
+
+    def rows(self, which: np.ndarray) -> "Pairs":
+        """Some of them."""
+        return jax.tree.map(lambda array: array[which], self)
+
+    def lost(self, model: delo.Model) -> np.ndarray:
+        """Which are off by more than the config's limits."""
+        limits = model.cfg.status
+        far = np.linalg.norm(self.errors[:, 3:], axis=1) > limits.lost_translation_m
+        return far | (np.linalg.norm(self.errors[:, :3], axis=1) > np.radians(limits.lost_rotation_deg))
+
+
+def solved_pairs(model: delo.Model, worlds: Iterable[World]) -> Pairs:
+    """Every pair of `FRAMES` of every world, from the identity and without a motion prior."""
+    rows = []
+    for number, world in enumerate(worlds):
+        encodings = [inference.encode(model, scan_of(world, frame, model.cfg.preprocess)) for frame in range(NUM_FRAMES)]
+        for source, target in FRAMES:
+            result = jax.device_get(inference.solve(model, encodings[source], encodings[target], jnp.eye(4)))
+            T_true = se3.inverse(world.Ts_world_lidar[target]) @ world.Ts_world_lidar[source]
+            T = se3.orthonormal(np.asarray(result.T_target_source, np.float64))
+            error = se3.log(se3.inverse(T) @ T_true)
+            rest = result.statistics, result.nig, result.confidence, result.information
+            rows.append(Pairs(error, T, *rest, np.array(number), np.array(target - source)))
+    return jax.tree.map(lambda *arrays: np.stack(arrays), *rows)
+
+
+def halves(model: delo.Model, weights: spread.Weights, pairs: Pairs) -> np.ndarray:
+    """(n, 6, 6) float64 H with H H^T the covariance of each pair."""
+    units = delo.evidence_units(model.cfg)
+    said = _said(pairs, units)
+    one = jax.vmap(spread.half, in_axes=(None, 0, 0, None))
+    return np.asarray(jax.jit(one)(weights, said, pairs.Ts_target_source.astype(np.float32), units), np.float64)
+
+
+def fit(model: delo.Model, pairs: Pairs) -> spread.Weights:
+    """Weights of `ops.spread` that make the errors of these pairs most likely, lost pairs apart (BFGS of optimistix)."""
+    pairs = pairs.rows(np.flatnonzero(~pairs.lost(model)))
+    units = delo.evidence_units(model.cfg)
+    said = _said(pairs, units)
+    start = spread.init(said.shape[1], WIDTH, jax.random.key(0))
+    fixed = {"mean": jnp.mean(said, axis=0), "deviation": jnp.std(said, axis=0) + 1e-3}
+    likelihood = jax.vmap(spread.negative_log_likelihood, in_axes=(None, 0, 0, 0, None))
+
+    def loss(free, rows):
+        decay = sum(jnp.sum(free[name] ** 2) for name in ("hidden", "out", "direct"))
+        return jnp.mean(likelihood(free | fixed, *rows, units)) + WEIGHT_DECAY * decay
+
+    free = {name: array for name, array in start.items() if name not in fixed}
+    rows = said, jnp.asarray(pairs.Ts_target_source, jnp.float32), jnp.asarray(pairs.errors, jnp.float32)
+    solver: Any = optimistix.BFGS(rtol=1e-5, atol=1e-6)
+    return optimistix.minimise(loss, solver, free, args=rows, max_steps=MAX_STEPS, throw=False).value | fixed
+
+
+def calibrate(model: delo.Model, pairs: Pairs, on_fit: Callable[[], None] = lambda: None) -> tuple[delo.Model, np.ndarray]:
+    """The model with a fitted covariance, and the covariances (n, 6, 6) of the pairs by fits that had not seen their worlds.
+
+    Covariances of worlds that a fit has seen are too small for others; by how much, the unseen ones say. Each axis, in the frame of the
+    motion, is scaled by the geometric mean of the factors that its coverage at 68 and at 95 % asks for: errors have heavier tails
+    than a Gaussian, so that no one factor satisfies both.
+
+    Args:
+        model: weights.
+        pairs: from `solved_pairs`.
+        on_fit: called after each of the five fits, for progress.
+    """
+    unseen = np.zeros((len(pairs.errors), 6, 6))
+    for fold in range(NUM_FOLDS):
+        away = pairs.worlds % NUM_FOLDS == fold
+        H = halves(model, fit(model, pairs.rows(np.flatnonzero(~away))), pairs.rows(np.flatnonzero(away)))
+        unseen[away] = H @ H.transpose(0, 2, 1)
+        on_fit()
+    good = ~pairs.lost(model)
+    turns = np.asarray(jax.vmap(spread.motion_frame)(jnp.asarray(pairs.Ts_target_source, jnp.float32)), np.float64)
+    backs = turns.transpose(0, 2, 1)
+    scale = _scale((backs @ pairs.errors[:, :, None])[good, :, 0], (backs @ unseen @ turns)[good])
+    weights = fit(model, pairs)
+    on_fit()
+    weights["out_bias"] = weights["out_bias"].at[spread.DIAGONAL].add(np.log(scale))
+    scaled = turns @ np.diag(scale) @ backs
+    evidence: Any = replace(model.cfg.evidence, covariance_width=WIDTH)
+    variables = model.variables | {"covariance": weights}
+    return delo.Model(variables, replace(model.cfg, evidence=evidence)), scaled @ unseen @ scaled.transpose(0, 2, 1)
+
+
+def _scale(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
+    """(6,) what the standard deviations have to be multiplied by."""
+    sizes = np.abs(errors) / np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    factors = [np.quantile(sizes, level, axis=0) / norm.ppf(0.5 + 0.5 * level) for level in LEVELS]
+    return np.exp(np.mean(np.log(factors), axis=0))
+
+
+def _said(pairs: Pairs, units) -> jax.Array:
+    """(n, i) inputs of the head."""
+    one = jax.vmap(spread.inputs, in_axes=(0, 0, 0, None))
+    return one(jnp.asarray(pairs.statistics), jax.tree.map(jnp.asarray, pairs.nig), jnp.asarray(pairs.confidence), units)

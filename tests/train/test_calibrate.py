@@ -1,0 +1,78 @@
+"""Covariances fitted to errors."""
+
+import jax
+import numpy as np
+import pytest
+
+from delo_jax.metrics.calibration import coverage, nees
+from delo_jax.model import delo
+from delo_jax.ops.evidence import NIG
+from delo_jax.train import calibrate as module
+from delo_jax.train.presets import PRESETS
+
+NUM_STATISTICS = 24
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Its weights do not matter here."""
+    return delo.init(PRESETS["tiny"].model, jax.random.key(0))
+
+
+def drawn(seed, n):
+    """Pairs whose errors have a size that one statistic tells, roll and lateral being correlated, far from what the evidence says."""
+    rng = np.random.default_rng(seed)
+    statistics = rng.normal(size=(n, NUM_STATISTICS)).astype(np.float32)
+    half = np.diag([1e-3, 5e-4, 2e-3, 0.02, 0.01, 0.005])
+    half[4, 0] = 0.01
+    size = np.exp(0.7 * statistics[:, 0])
+    errors = size[:, None] * (rng.normal(size=(n, 6)) @ half.T)
+    Ts = np.tile(np.eye(4), (n, 1, 1))
+    Ts[:, 0, 3] = -2.0  # towards -x of the source frame: the frame of the motion is turned by 180 degrees
+    ones = np.ones((n, 6), np.float32)
+    nig = NIG(0 * ones, ones, 2 * ones, 1e-4 * ones)
+    information = np.tile(np.eye(6), (n, 1, 1))
+    covariances = size[:, None, None] ** 2 * (half @ half.T)
+    pairs = module.Pairs(errors, Ts, statistics, nig, np.full(n, 0.9, np.float32), information, np.arange(n) // 11, np.ones(n, int))
+    return pairs, covariances
+
+
+def test_fit_finds_the_covariances_that_the_errors_were_drawn_from(model, monkeypatch):
+    """Oracle: the construction, on pairs that the fit has not seen; a tenth of them lost, by metres, which must not widen the others."""
+    monkeypatch.setattr(module, "NUM_FOLDS", 2)
+    monkeypatch.setattr(module, "MAX_STEPS", 80)
+    pairs, _ = drawn(0, 4400)
+    pairs.errors[::10] += 3.0
+    assert pairs.lost(model).sum() >= 440
+    calibrated, unseen = module.calibrate(model, pairs)
+    fresh, expected = drawn(1, 1000)
+    H = module.halves(calibrated, calibrated.variables["covariance"], fresh)
+    covariances = H @ H.transpose(0, 2, 1)
+    sigma, true = (np.sqrt(np.diagonal(C, axis1=1, axis2=2)) for C in (covariances, expected))
+    assert np.median(np.abs(np.log(sigma / true))) < 0.2
+    correlation, right = (C[:, 0, 4] / np.sqrt(C[:, 0, 0] * C[:, 4, 4]) for C in (covariances, expected))
+    assert np.abs(np.median(correlation) - np.median(right)) < 0.1
+    assert 0.8 < nees(fresh.errors, covariances).mean() / 6 < 1.25
+    good = ~pairs.lost(model)
+    spreads = np.sqrt(np.diagonal(unseen[good], axis1=1, axis2=2))
+    off = [coverage(pairs.errors[good], spreads, level) - level for level in module.LEVELS]
+    np.testing.assert_allclose(off, 0.0, atol=0.03)
+    np.testing.assert_allclose(coverage(fresh.errors, sigma, 0.68), 0.68, atol=0.07)
+    assert calibrated.cfg.evidence.covariance_width == module.WIDTH
+
+
+def test_pairs_of_a_world_are_solved_and_measured(model, monkeypatch):
+    """Oracle: two worlds of one scan seen again and again: the truth of every pair is the identity."""
+    from delo_jax.preprocess import Scan, preprocess
+    from delo_jax.train.worlds import World
+    from tests.oracles import street
+
+    scan = preprocess(street.scan(street.pose()).points, model.cfg.preprocess)
+    world = World(Scan(*(np.stack([array] * module.NUM_FRAMES) for array in scan)), np.tile(street.pose(), (module.NUM_FRAMES, 1, 1)))
+    monkeypatch.setattr(module, "FRAMES", ((0, 1), (5, 2)))
+    pairs = module.solved_pairs(model, [world, world])
+    assert pairs.errors.shape == (4, 6)
+    np.testing.assert_array_equal(pairs.worlds, [0, 0, 1, 1])
+    np.testing.assert_array_equal(pairs.gaps, [1, -3, 1, -3])
+    for error, T in zip(pairs.errors, pairs.Ts_target_source, strict=True):
+        np.testing.assert_allclose(np.linalg.norm(error[3:]), np.linalg.norm(np.linalg.inv(T)[:3, 3]), rtol=0.2, atol=1e-6)
