@@ -122,7 +122,9 @@ def align(params: delo.Model, source: PreparedScan, target: PreparedScan, T_targ
     """Estimate of a pair of scans from a start; see `odometry`."""
     limits = params.cfg.status
     start = np.asarray(T_target_source_init, np.float64)
-    result = jax.device_get(solve(params, source.encoding, target.encoding, jnp.asarray(start, jnp.float32)))
+    solved = solve(params, source.encoding, target.encoding, jnp.asarray(start, jnp.float32))
+    half = covariance_half(params, solved) if params.cfg.evidence.covariance_width else None
+    result, half = jax.device_get((solved, half))
     seen = observability(result.information) if result.finite else observability(np.zeros((6, 6)))
     head = params.cfg.evidence.head
     health = status.judge(
@@ -136,8 +138,8 @@ def align(params: delo.Model, source: PreparedScan, target: PreparedScan, T_targ
     if health.status != "rejected":
         nig = [np.asarray(value, np.float64) for value in result.nig]
         T = se3.orthonormal(np.asarray(result.T_target_source, np.float64))
-        if params.cfg.evidence.covariance_width:
-            known = covariance.from_half(np.asarray(covariance_half(params, result), np.float64), nig[1])
+        if half is not None:
+            known = covariance.from_half(np.asarray(half, np.float64), nig[1])
         elif head == "statistics":
             known = covariance.from_evidence(*nig)
         elif head == "embedding":

@@ -2,12 +2,15 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import delo_jax
+from delo_jax import inference
 from delo_jax.config import DeloConfig
 from delo_jax.errors import ScanError
 from delo_jax.geometry import se3
@@ -49,6 +52,18 @@ def assert_unknown(estimate, T_start):
 
 def as_bytes(estimate):
     return b"".join(np.asarray(value).tobytes() for value in dataclasses.astuple(estimate))
+
+
+def test_a_pair_without_points_compiles_everything_that_a_good_one_needs():
+    """Oracle: the sizes of the caches, with the released weights, which are calibrated."""
+    params, nothing = delo_jax.load("delo-base"), np.zeros((0, 3), np.float32)
+    functions: tuple[Any, ...] = (inference.encode, inference.solve, inference.covariance_half)
+    assert odometry(params, nothing, nothing).status == "rejected"
+    sizes = [function._cache_size() for function in functions]
+    estimate = odometry(params, *(street.scan(street.pose(x), noise_m=0.02, seed=2).points for x in (0.0, 0.4)))
+    assert_sound(estimate)
+    assert estimate.status != "rejected"
+    assert [function._cache_size() for function in functions] == sizes
 
 
 def test_untrained_network_comes_near_on_a_simulated_pair():
