@@ -29,7 +29,7 @@ class Calibrate(Command):
     """Name of released weights, or a .safetensors file with its card."""
     out: Path = Path("runs/calibrated")
     """Folder for worlds and the calibrated weights; worlds that are there are not made again."""
-    num_worlds: int = 600
+    num_worlds: int = 900
     """Simulated worlds, eleven pairs each: about a second each on two cores."""
 
     def run(self) -> int:
