@@ -26,13 +26,14 @@ from _harness import Row
 import delo_jax
 from delo_jax.metrics.calibration import coverage, nees, negative_log_likelihood, sparsification_error
 from delo_jax.model.delo import Model
+from delo_jax.train.calibrate import LEVELS as BOUNDED_LEVELS
 from delo_jax.train.calibrate import NUM_FRAMES, Pairs, halves, solved_pairs
 from delo_jax.train.worlds import CALIBRATION_SEED, stored_worlds
 from delo_jax.uncertainty import covariance
+from delo_jax.uncertainty.observability import AXES
 
 UNSEEN_SEED = 1_600_000
 NUM_UNSEEN, NUM_FITTED, NUM_QUICK = 150, 200, 4
-AXES = "roll", "pitch", "yaw", "forward", "lateral", "vertical"
 UNITS = np.repeat([1e-3, 1e-2], 3)  # rad, m
 LEVELS = (0.5, 0.68, 0.9, 0.95, 0.99)
 POINTS, NEES_RANGE = 5.0, (0.8, 1.25)
@@ -125,7 +126,7 @@ def judge(pairs: Pairs, C: np.ndarray) -> list[Row]:
     """Bounds of the default."""
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
     rows = []
-    for level in (0.68, 0.95):
+    for level in BOUNDED_LEVELS:
         shares = 100 * coverage(pairs.errors, sigma, level)
         for axis, share in zip(AXES, shares, strict=True):
             rows.append(Row(f"{axis}: coverage at {100 * level:.0f} %, off by", abs(float(share) - 100 * level), "points", POINTS))

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     import numpy as np
 
 MIN_WORLDS = 8
-AXES = "roll", "pitch", "yaw", "forward", "lateral", "vertical"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -81,11 +80,10 @@ def measures(errors: "np.ndarray", covariances: "np.ndarray") -> dict[str, Any]:
     import numpy as np
 
     from delo_jax.metrics.calibration import coverage, nees, negative_log_likelihood
+    from delo_jax.train.calibrate import LEVELS
 
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    shares = {
-        f"coverage at {100 * level:.0f} %": [round(float(share), 4) for share in coverage(errors, sigmas, level)] for level in (0.68, 0.95)
-    }
+    shares = {f"coverage at {100 * level:.0f} %": [round(float(share), 4) for share in coverage(errors, sigmas, level)] for level in LEVELS}
     squares = float(np.mean(nees(errors, covariances))) / errors.shape[1]
     return shares | {"nees / 6": round(squares, 4), "nats": round(float(np.mean(negative_log_likelihood(errors, covariances))), 4)}
 
@@ -93,6 +91,7 @@ def measures(errors: "np.ndarray", covariances: "np.ndarray") -> dict[str, Any]:
 def show(title: str, measured: dict[str, Any]) -> None:
     """A table of them."""
     from delo_jax.cli.console import print_table
+    from delo_jax.uncertainty.observability import AXES
 
     rows = [(name, *(f"{100 * share:.1f}" for share in value)) for name, value in measured.items() if isinstance(value, list)]
     print_table(title, ("", *AXES), rows, right=range(1, 7))

@@ -17,9 +17,7 @@ def nees(errors: Float[np.ndarray, "n k"], covariances: Float[np.ndarray, "m j l
     Raises:
         DeloError: unequal lengths, NaN or infinity, a covariance that is not positive definite.
     """
-    errors, halves = _whitening(errors, covariances)
-    white = np.linalg.solve(halves, errors[:, :, None])[:, :, 0]
-    return np.sum(white**2, axis=1)
+    return _squares(*_factored(errors, covariances))
 
 
 def negative_log_likelihood(errors: Float[np.ndarray, "n k"], covariances: Float[np.ndarray, "m j l"]) -> Float64[np.ndarray, " n"]:
@@ -32,9 +30,9 @@ def negative_log_likelihood(errors: Float[np.ndarray, "n k"], covariances: Float
     Raises:
         DeloError: as `nees`.
     """
-    errors, halves = _whitening(errors, covariances)
-    log_det = 2.0 * np.sum(np.log(np.diagonal(halves, axis1=1, axis2=2)), axis=1)
-    return 0.5 * (nees(errors, covariances) + log_det + errors.shape[1] * np.log(2.0 * np.pi))
+    errors, factors = _factored(errors, covariances)
+    log_det = 2.0 * np.sum(np.log(np.diagonal(factors, axis1=1, axis2=2)), axis=1)
+    return 0.5 * (_squares(errors, factors) + log_det + errors.shape[1] * np.log(2.0 * np.pi))
 
 
 def coverage(errors: Float[np.ndarray, "n k"], sigmas: Float[np.ndarray, "m j"], level: float) -> Float64[np.ndarray, " k"]:
@@ -87,7 +85,12 @@ def auroc(scores: Float[np.ndarray, " n"], positive: Bool[np.ndarray, " n"]) -> 
     return float((ranks[positive].sum() - num * (num + 1) / 2) / (num * (len(ranks) - num)))
 
 
-def _whitening(errors: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _squares(errors: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    white = np.linalg.solve(factors, errors[:, :, None])[:, :, 0]
+    return np.sum(white**2, axis=1)
+
+
+def _factored(errors: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Both checked, the covariances as lower Cholesky factors."""
     errors, covariances = _checked(errors, "errors"), _checked(covariances, "covariances")
     expected = (*errors.shape, errors.shape[-1])

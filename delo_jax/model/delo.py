@@ -140,7 +140,7 @@ def init(cfg: DeloConfig, key: Key[Array, ""]) -> Model:
     """Model with random weights, for training only."""
     variables = dict(Network(cfg).init(key, *example_inputs(cfg), method="everything"))
     if cfg.evidence.covariance_width:
-        variables["covariance"] = spread.init(NUM_STATISTICS + 7, cfg.evidence.covariance_width, key)
+        variables["covariance"] = spread.init(NUM_STATISTICS + spread.NUM_OWN_INPUTS, cfg.evidence.covariance_width, key)
     return Model(variables, cfg)
 
 

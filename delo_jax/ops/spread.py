@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key
 from delo_jax.geometry.se3 import full_float32
 from delo_jax.ops.evidence import NIG, moments
 
-NUM_OUTPUTS = 21
+NUM_OWN_INPUTS, NUM_OUTPUTS = 7, 21  # beside the statistics: six standard deviations and the odds; a triangle
 LARGEST_INPUT = 4.0  # standard deviations; beyond lies what the fit has not seen
 _ROWS, _COLUMNS = np.tril_indices(6)
 DIAGONAL = np.flatnonzero(_ROWS == _COLUMNS)  # outputs that are logarithms of the factor's diagonal
