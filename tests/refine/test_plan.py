@@ -1,0 +1,104 @@
+"""The plan of a pose graph."""
+
+import numpy as np
+import pytest
+
+from delo_jax.errors import DeloError
+from delo_jax.geometry import se3
+from delo_jax.refine import plan as plans
+from tests.refine.graphs import chained, drive, measured, noisy_plan
+
+
+def test_odometry_factors_lead_to_the_poses_again():
+    """Oracle: chaining the factors over rejected frames gives the poses that they were made of."""
+    Ts = drive(6)
+    since = np.array([0, 0, 1, 1, 1, 4])  # frames 2 and 3 were rejected
+    rows = plans.odometry_factors(Ts, since, np.tile(np.eye(6), (6, 1, 1)))
+    again = [Ts[0]]
+    for source, T in zip(rows.sources, rows.Ts_source_target, strict=True):
+        again.append(again[source] @ T)
+    assert rows.targets.tolist() == [1, 2, 3, 4, 5]
+    assert not rows.robust.any()
+    np.testing.assert_allclose(np.stack(again), Ts, atol=1e-12)
+
+
+def test_frames_before_the_first_usable_one_are_held_loosely():
+    """Oracle: by hand; frames 0 and 1 were unusable (wide), frame 2 defines the world (exact), frame 3 was measured."""
+    wide, fine = np.eye(6), 1e-4 * np.eye(6)
+    rows = plans.odometry_factors(drive(4), np.array([0, 1, 2, 2]), np.stack([wide, wide, 0 * wide, fine]))
+    assert rows.sources.tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(rows.covariances, np.stack([wide, wide, fine]))
+
+
+def test_multi_frame_pairs_are_those_of_the_paper():
+    """Oracle: the paper's o = 2 and p = 4, written out for ten frames."""
+    pairs = {tuple(row) for row in plans.multi_frame_pairs(10).tolist()}
+    assert pairs == {(f, f + 2) for f in range(8)} | {(0, 4), (4, 8)}
+    assert len(plans.multi_frame_pairs(2)) == 0
+
+
+def test_a_good_plan_passes():
+    """Oracle: nothing is wrong with it."""
+    plan = noisy_plan(12, seed=0)
+    assert plans.check(plan) is plan
+
+
+def spoiled(**changes) -> plans.Plan:
+    """A plan of which the fourth factor is replaced in part."""
+    plan = noisy_plan(8, seed=1)
+    rows = plan.factors._asdict()
+    for name, value in changes.items():
+        rows[name] = rows[name].copy()
+        rows[name][3] = value
+    return plan._replace(factors=plans.Factors(**rows))
+
+
+NAN = np.full((4, 4), np.nan)
+TILTED = np.eye(4) + 1e-3 * np.eye(4, k=1)
+MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"Ts_source_target": NAN}, r"factor 3 \(frame 3 to 4, odometry\): expected finite numbers, got 16"),
+        ({"Ts_source_target": TILTED}, "expected an orthonormal rotation"),
+        ({"Ts_source_target": MIRROR}, "a reflection"),
+        ({"covariances": np.full((6, 6), np.inf)}, "not finite"),
+        ({"covariances": np.zeros((6, 6))}, "a singular one"),
+        ({"covariances": np.ones((6, 6))}, "a singular one"),
+        ({"covariances": -np.eye(6)}, "a singular one"),
+        ({"covariances": np.eye(6) + np.eye(6, k=1)}, "not symmetric"),
+        ({"targets": 8}, "two different frames of 0 to 7, got 3 and 8"),
+        ({"targets": 3}, "two different frames"),
+        ({"sources": -1}, "two different frames"),
+    ],
+)
+def test_what_no_backend_could_solve_is_refused(changes, says):
+    """Oracle: what is wrong was put there."""
+    with pytest.raises(DeloError, match=says):
+        plans.check(spoiled(**changes))
+
+
+def test_a_graph_in_parts_is_refused():
+    """Oracle: without the factors across frame 4 and 5, frames 5 to 9 hang on nothing."""
+    plan = noisy_plan(10, seed=2)
+    across = (plan.factors.sources <= 4) & (plan.factors.targets >= 5)
+    with pytest.raises(DeloError, match="got 2: nothing holds frame 5 to frame 0"):
+        plans.check(plan._replace(factors=plan.factors.rows(~across)))
+
+
+@pytest.mark.parametrize("Ts", [np.eye(4)[None], np.zeros((3, 3, 3)), np.stack([np.eye(4), NAN])])
+def test_poses_that_are_none_are_refused(Ts):
+    """Oracle: one pose, another shape, not a number."""
+    rows = plans.factors([0], [1], np.eye(4)[None], np.eye(6)[None], plans.ODOMETRY)
+    with pytest.raises(DeloError, match="expected"):
+        plans.check(plans.Plan(Ts, rows))
+
+
+def test_joined_factors_keep_their_kind():
+    """Oracle: order of the lots; only the odometry is trusted altogether."""
+    Ts, rng = drive(4), np.random.default_rng(0)
+    both = plans.joined([measured(Ts, np.array([[0, 1]]), plans.ODOMETRY, rng), measured(Ts, np.array([[0, 3]]), plans.LOOP, rng)])
+    assert both.robust.tolist() == [False, True]
+    np.testing.assert_allclose(chained(both.rows(np.array([0])))[1], se3.exp(se3.log(both.Ts_source_target[0])), atol=1e-12)
