@@ -18,6 +18,7 @@ from delo_jax.config.model import (
     PreprocessConfig,
     StatusConfig,
 )
+from delo_jax.config.refining import GATES, RefineConfig
 from delo_jax.config.toml import from_dict, load, to_toml
 from delo_jax.config.training import TrainConfig
 
@@ -27,6 +28,7 @@ __all__ = [
     "EncoderConfig",
     "EvidenceConfig",
     "FineConfig",
+    "GATES",
     "LEVER_M",
     "MIN_EPSILON",
     "MatchingConfig",
@@ -34,6 +36,7 @@ __all__ = [
     "PLANS",
     "PoseConfig",
     "PreprocessConfig",
+    "RefineConfig",
     "SAMPLINGS",
     "SOLVERS",
     "StatusConfig",

@@ -5,7 +5,7 @@ import numpy as np
 
 from delo_jax.errors import DeloError
 from delo_jax.geometry import se3
-from delo_jax.refine.gtsam_backend import gauge, graph_of
+from delo_jax.refine.gtsam_backend import by_qr, gauge, graph_of
 from delo_jax.refine.plan import ODOMETRY, Factors, check_factors, factors, joined
 
 LAG = 20  # frames
@@ -20,8 +20,7 @@ class FixedLagSmoother:
     """
 
     def __init__(self, T_world_first: np.ndarray, *, lag: int = LAG):
-        options = gtsam.ISAM2Params()
-        options.setFactorization("QR")  # what is marginalised is known better and better: Cholesky fails after some hundred frames
+        options = by_qr()
         options.relinearizeSkip = 1
         options.setRelinearizeThreshold(0.001)
         self._lag, self._smoother = lag, gtsam.IncrementalFixedLagSmoother(float(lag), options)

@@ -15,6 +15,13 @@ def gauge(T_world_lidar: np.ndarray, number: int = 0) -> gtsam.PriorFactorPose3:
     return gtsam.PriorFactorPose3(number, gtsam.Pose3(T_world_lidar), gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SIGMA))
 
 
+def by_qr() -> gtsam.ISAM2Params:
+    """Options of a Bayes tree: kilometres from the first pose, and where much was marginalised, Cholesky fails."""
+    options = gtsam.ISAM2Params()
+    options.setFactorization("QR")
+    return options
+
+
 def graph_of(factors: Factors) -> gtsam.NonlinearFactorGraph:
     """The factors as GTSAM's; twists and perturbations are the same there: right, [omega, v]."""
     loss = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_SCALE)
@@ -49,8 +56,9 @@ def solve(plan: Plan) -> Refined:
     try:
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, options)
         found = optimizer.optimize()
-        marginals = gtsam.Marginals(graph, found)
-        covariances = np.stack([marginals.marginalCovariance(number) for number in range(len(Ts))])
+        tree = gtsam.ISAM2(by_qr())
+        tree.update(graph, found)
+        covariances = np.stack([tree.marginalCovariance(number) for number in range(len(Ts))])
     except RuntimeError as error:  # an indeterminate system
         raise DeloError(f"graph: expected one that determines all poses, got {str(error).strip().splitlines()[0]}") from error
     Ts_refined = np.stack([Ts[0], *(found.atPose3(number).matrix() for number in range(1, len(Ts)))])

@@ -15,6 +15,7 @@ ODOMETRY, MULTI_FRAME, LOOP = range(len(KINDS))
 ODOMETRY_GAP, KEY_GAP = 2, 4  # the paper's o and p, frames
 CAUCHY_SCALE = 6.0  # of the length of a whitened residual; factors of honest noise keep 86 % of their weight
 GAUGE_SIGMA = 1e-8  # of the first pose, which defines the world [rad, m]
+STILL = np.repeat([1e-5, 1e-4], 3)  # a pose is handed on no better than this [rad, m]
 _ORTHONORMAL = 1e-6
 _SMALLEST_SHARE = 1e-10  # smallest eigenvalue of a correlation matrix that can be inverted
 
@@ -74,28 +75,55 @@ def joined(parts: Sequence[Factors]) -> Factors:
     return Factors(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def odometry_factors(Ts_world_lidar: np.ndarray, since: np.ndarray, covariances: np.ndarray) -> Factors:
+def odometry_factors(Ts_world_lidar: np.ndarray, since: np.ndarray, covariances: np.ndarray, local: np.ndarray) -> Factors:
     """One factor per frame from the second on: its motion since the frame that the odometry measured it from.
 
-    Frames before the first usable one hang on the frame before them, as loosely as the odometry said.
+    The graph is about what errors are handed on from frame to frame. What is wrong with a single pose, its place on the map, is nothing
+    that a chain of motions adds up: it goes to the factors that are measured from that frame, see `between_frames`.
 
     Args:
         Ts_world_lidar: (n, 4, 4) poses of the odometry.
         since: (n,) number of the frame that each motion starts from; a frame's own number where there is none.
-        covariances: (n, 6, 6) of these motions.
+        covariances: (n, 6, 6) of the poses.
+        local: (n, 6, 6) the part of them that is not handed on.
     """
     targets = np.arange(1, len(Ts_world_lidar))
-    free = since[1:] >= targets
-    sources = np.where(free, targets - 1, since[1:])
-    exact = free & (np.trace(covariances[1:], axis1=1, axis2=2) == 0.0)  # the first usable frame: nothing led there
-    Cs = np.where(exact[:, None, None], covariances[:-1], covariances[1:])
-    return factors(sources, targets, se3.inverse(Ts_world_lidar[sources]) @ Ts_world_lidar[targets], Cs, ODOMETRY)
+    sources = np.where(since[1:] >= targets, targets - 1, since[1:])  # before the first usable frame there is no motion
+    steps = se3.inverse(Ts_world_lidar[sources]) @ Ts_world_lidar[targets]
+    handed_on = covariances - local
+    grown = handed_on[targets] - carried(handed_on[sources], steps)
+    values, vectors = np.linalg.eigh(0.5 * (grown + grown.transpose(0, 2, 1)) / (STILL[:, None] * STILL))
+    halves = STILL[:, None] * vectors * np.sqrt(values.clip(min=0.0) + 1.0)[:, None, :]
+    return factors(sources, targets, steps, halves @ halves.transpose(0, 2, 1), ODOMETRY)
+
+
+def carried(covariances: np.ndarray, Ts_step: np.ndarray) -> np.ndarray:
+    """Covariances (k, 6, 6) of poses as those of what lies a step (k, 4, 4) further on."""
+    Ad = se3.adjoint(se3.inverse(Ts_step))
+    return Ad @ covariances @ Ad.transpose(0, 2, 1)
+
+
+def between_frames(pairs: np.ndarray, Ts_source_target: np.ndarray, covariances: np.ndarray, local: np.ndarray, kind: int) -> Factors:
+    """Measured motions as factors between what the odometry hands on.
+
+    Args:
+        pairs: (k, 2) frames.
+        Ts_source_target: (k, 4, 4).
+        covariances: (k, 6, 6) of the measurements.
+        local: (n, 6, 6) of all frames, as in `odometry_factors`.
+        kind: place in KINDS.
+    """
+    sources, targets = np.asarray(pairs).reshape(-1, 2).T
+    if len(sources) == 0:
+        return factors([], [], np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), kind)
+    total = covariances + carried(local[sources], Ts_source_target) + local[targets]
+    return factors(sources, targets, Ts_source_target, total, kind)
 
 
 def multi_frame_pairs(num_frames: int, *, odometry_gap: int = ODOMETRY_GAP, key_gap: int = KEY_GAP) -> np.ndarray:
-    """(k, 2) frames to register to each other beside the odometry: (f, f + o) of all, (f, f + p) of every p-th (paper, 3.3)."""
-    every = np.arange(max(num_frames - odometry_gap, 0))
-    keys = np.arange(0, max(num_frames - key_gap, 0), key_gap)
+    """(k, 2) frames to register beside the odometry: (f, f + o) of all, (f, f + p) of every p-th (paper, 3.3); a gap of 0: none."""
+    every = np.arange(max(num_frames - odometry_gap, 0) if odometry_gap else 0)
+    keys = np.arange(0, max(num_frames - key_gap, 0), max(key_gap, 1)) if key_gap else every[:0]
     return np.concatenate([np.stack([every, every + odometry_gap], 1), np.stack([keys, keys + key_gap], 1)])
 
 

@@ -11,9 +11,9 @@ from tests.refine.graphs import chained, drive, measured, noisy_plan
 
 def test_odometry_factors_lead_to_the_poses_again():
     """Oracle: chaining the factors over rejected frames gives the poses that they were made of."""
-    Ts = drive(6)
+    Ts, none = drive(6), np.zeros((6, 6, 6))
     since = np.array([0, 0, 1, 1, 1, 4])  # frames 2 and 3 were rejected
-    rows = plans.odometry_factors(Ts, since, np.tile(np.eye(6), (6, 1, 1)))
+    rows = plans.odometry_factors(Ts, since, none, none)
     again = [Ts[0]]
     for source, T in zip(rows.sources, rows.Ts_source_target, strict=True):
         again.append(again[source] @ T)
@@ -22,12 +22,37 @@ def test_odometry_factors_lead_to_the_poses_again():
     np.testing.assert_allclose(np.stack(again), Ts, atol=1e-12)
 
 
-def test_frames_before_the_first_usable_one_are_held_loosely():
-    """Oracle: by hand; frames 0 and 1 were unusable (wide), frame 2 defines the world (exact), frame 3 was measured."""
-    wide, fine = np.eye(6), 1e-4 * np.eye(6)
-    rows = plans.odometry_factors(drive(4), np.array([0, 1, 2, 2]), np.stack([wide, wide, 0 * wide, fine]))
+def test_a_factor_holds_what_the_covariance_has_grown_by():
+    """Oracle: covariances composed by hand from known steps, with a part of each pose that is not handed on."""
+    Ts, rng = drive(5), np.random.default_rng(0)
+    halves = rng.normal(size=(5, 6, 6))
+    steps, local = 1e-4 * halves @ halves.transpose(0, 2, 1), 1e-3 * np.tile(np.eye(6), (5, 1, 1))
+    handed_on = [np.zeros((6, 6))]
+    for k in range(1, 5):
+        handed_on.append(se3.compose_covariance(handed_on[-1], steps[k], se3.inverse(Ts[k - 1]) @ Ts[k]))
+    rows = plans.odometry_factors(Ts, np.array([0, 0, 1, 2, 3]), np.stack(handed_on) + local, local)
+    np.testing.assert_allclose(rows.covariances, steps[1:] + np.diag(plans.STILL**2), rtol=1e-6, atol=1e-12)
+
+
+def test_frames_before_the_first_usable_one_hang_on_each_other():
+    """Oracle: by hand; frames 0 and 1 were unusable, frame 2 defines the world, frame 3 was measured from it."""
+    none = np.zeros((4, 6, 6))
+    rows = plans.odometry_factors(drive(4), np.array([0, 1, 2, 2]), none, none)
     assert rows.sources.tolist() == [0, 1, 2]
-    np.testing.assert_array_equal(rows.covariances, np.stack([wide, wide, fine]))
+    np.testing.assert_allclose(rows.covariances, np.tile(np.diag(plans.STILL**2), (3, 1, 1)), rtol=1e-9)
+
+
+def test_factors_between_frames_hold_what_is_wrong_with_both_ends():
+    """Oracle: sampling: the motion between two poses, each off by its own local error."""
+    rng, Ts = np.random.default_rng(1), drive(4)
+    halves = 1e-2 * rng.normal(size=(4, 6, 6))
+    local, T = halves @ halves.transpose(0, 2, 1), se3.inverse(Ts[0]) @ Ts[3]
+    row = plans.between_frames(np.array([[0, 3]]), T[None], 1e-12 * np.eye(6)[None], local, plans.LOOP)
+    first, last = (se3.exp((halves[k] @ rng.normal(size=(20_000, 6, 1)))[..., 0]) for k in (0, 3))
+    twists = se3.log(se3.inverse(T) @ se3.inverse(first) @ T @ last)
+    sampled = np.cov(twists.T)
+    scale = np.sqrt(np.diag(sampled))
+    np.testing.assert_allclose(row.covariances[0] / np.outer(scale, scale), sampled / np.outer(scale, scale), atol=0.05)
 
 
 def test_multi_frame_pairs_are_those_of_the_paper():
@@ -35,6 +60,8 @@ def test_multi_frame_pairs_are_those_of_the_paper():
     pairs = {tuple(row) for row in plans.multi_frame_pairs(10).tolist()}
     assert pairs == {(f, f + 2) for f in range(8)} | {(0, 4), (4, 8)}
     assert len(plans.multi_frame_pairs(2)) == 0
+    assert plans.multi_frame_pairs(6, odometry_gap=0).tolist() == [[0, 4]]
+    assert plans.multi_frame_pairs(4, key_gap=0).tolist() == [[0, 2], [1, 3]]
 
 
 def test_a_good_plan_passes():
