@@ -30,7 +30,8 @@ class Estimate:
 
     Variances and the covariance are those of `T_target_source` under a right perturbation, order [omega, v], rad and m.
     Those of a pair are fitted by `delo calibrate`; of weights that are not calibrated they are the evidence head's own, and a preset
-    without one says that it knows nothing. Those of a scan on a map come from the information matrix of its last solve, not calibrated.
+    without one says that it knows nothing. Those of a scan on a map are fitted by `delo calibrate` on simulated drives
+    (`uncertainty.stream`); of weights without these numbers they come from the information matrix of its last solve, not calibrated.
     """
 
     T_target_source: np.ndarray

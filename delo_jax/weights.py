@@ -73,6 +73,10 @@ def load(name: str | Path = "delo-base") -> delo.Model:
         raise WeightsError(f"{path}: expected a safetensors file, got {error}; fetch it again") from error
     cfg = config.from_dict(config.DeloConfig, card["config"], f"{path.name} config")
     template = jax.eval_shape(lambda: delo.init(cfg, jax.random.key(0))).variables
+    if any(name.startswith("stream/") for name in tensors):  # weights from before, or not calibrated for drives, have none
+        template["stream"] = {name: jax.ShapeDtypeStruct((), jnp.float32) for name in delo.STREAM_NUMBERS}
+    if any(name.startswith("gate/") for name in tensors):
+        template["gate"] = {name: jax.ShapeDtypeStruct(shape, jnp.float32) for name, shape in delo.GATE_SHAPES.items()}
     leaves, tree = jax.tree_util.tree_flatten_with_path(template)
     names = [_name(key_path) for key_path, _ in leaves]
     expected = {name: (leaf.shape, leaf.dtype) for name, (_, leaf) in zip(names, leaves, strict=True)}

@@ -187,7 +187,7 @@ def wrong_loops() -> list[Row]:
     plan = noisy_plan(Ts, rng)
     ends = np.sort(rng.choice(300, size=(NUM_WRONG, 2), replace=False), axis=1)
     T_wrong = se3.exp(np.concatenate([rng.normal(size=(NUM_WRONG, 3)), 10.0 * rng.normal(size=(NUM_WRONG, 3))], axis=1))
-    wrong = plans.factors(*ends.T, T_wrong, np.broadcast_to(np.diag(SIGMAS**2), (NUM_WRONG, 6, 6)), plans.LOOP)
+    wrong = plans.factors(ends[:, 0], ends[:, 1], T_wrong, np.broadcast_to(np.diag(SIGMAS**2), (NUM_WRONG, 6, 6)), plans.LOOP)
     without, spoiled = (
         absolute_errors(gtsam_backend.solve(plan._replace(factors=rows)).Ts_world_lidar, Ts).rmse_m
         for rows in (plan.factors, plans.joined([plan.factors, wrong]))

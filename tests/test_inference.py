@@ -248,13 +248,12 @@ def test_network_without_a_head_says_that_it_knows_nothing():
     assert not np.allclose(estimate.T_target_source, START)
 
 
-@pytest.mark.parametrize("preset", ["paper", "official"])
-def test_evidence_of_embeddings_becomes_a_covariance(preset):
+def test_evidence_of_embeddings_becomes_a_covariance():
     """Oracle: Monte Carlo. Poses drawn as independent angles and translations of the head's variances, relative to the estimate.
 
     Variances to 3 %; the covariance is symmetric, positive definite and not below that of the draws.
     """
-    model = held(narrow_model(preset))
+    model = held(narrow_model("paper"))  # `official` has the same head
     estimate = odometry(model, street_points(0), street_points(1))
     assert_sound(estimate)
     assert estimate.status in ("ok", "low_confidence")

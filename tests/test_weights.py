@@ -54,6 +54,18 @@ def test_round_trip_keeps_every_bit(stored):
     assert all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for (_, a), (_, b) in zip(leaves, expected, strict=True))
 
 
+def test_numbers_of_a_drive_travel_with_the_weights(tmp_path, stored):
+    """Oracle: what was saved; weights without them load too, and a missing number is noticed."""
+    numbers = {name: np.float32(0.1 * k) for k, name in enumerate(delo.STREAM_NUMBERS)}
+    model = dataclasses.replace(tiny_model(), variables=tiny_model().variables | {"stream": numbers})
+    found = weights.load(weights.save(tmp_path / "with", model, {})).variables["stream"]
+    assert {name: float(value) for name, value in found.items()} == {name: float(value) for name, value in numbers.items()}
+    assert "stream" not in weights.load(stored).variables
+    del numbers[delo.STREAM_NUMBERS[0]]
+    with pytest.raises(WeightsError, match="stream/share"):
+        weights.load(weights.save(tmp_path / "less", model, {}))
+
+
 def test_file_is_plain_safetensors(stored):
     """Oracle: the format read by hand, and the names of the params; there is no pickle in it."""
     tensors = read_safetensors(stored.read_bytes())

@@ -12,6 +12,7 @@ from delo_jax.cli.command import Command
 from delo_jax.cli.demo import Demo
 from delo_jax.cli.doctor import Doctor
 from delo_jax.cli.eval import Eval
+from delo_jax.cli.refine import Refine
 from delo_jax.cli.run import Run
 from delo_jax.cli.simulate import Simulate
 from delo_jax.cli.train import Train
@@ -20,6 +21,7 @@ from delo_jax.errors import DeloError
 
 COMMANDS: dict[str, type[Command]] = {
     "run": Run,
+    "refine": Refine,
     "eval": Eval,
     "demo": Demo,
     "simulate": Simulate,

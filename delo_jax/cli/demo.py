@@ -20,7 +20,7 @@ POINTS_PER_PICTURE = 150_000
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Demo(Command):
-    """A simulated drive through network, odometry, covariance, status and pictures; needs no data and no network connection.
+    """A simulated drive through network, odometry, covariance, status, pose graph and pictures; needs no data and no network connection.
 
     Example: delo demo --out delo_demo
     """
@@ -51,6 +51,8 @@ class Demo(Command):
             weights=self.weights,
             use_map=True,
             deskew=True,
+            refine=True,
+            stamp_sigma_s=0.0,
             stage="simulate",
             facts={
                 "dataset": {"path": None, "sequence": None, "name": source.name, "layout": f"simulated, kind {KIND}, seed {SEED}"},

@@ -1,7 +1,6 @@
 """`delo eval`: how far a run is from the truth."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 import tyro
 
 from delo_jax.cli.command import Command
+from delo_jax.cli.stored import facts_of, poses_of, to_lidar
 from delo_jax.errors import DatasetError
 
 GAPS = (1, 2, 5)
@@ -27,13 +27,16 @@ class Eval(Command):
     truth: Path | None = None
     """KITTI poses (camera frame, where the run has a calibration) or a TUM file; by default the truth of the run's own dataset."""
 
+    refined: bool = False
+    """Of the poses that `delo refine` or `delo run --refine` has left, rather than those of the odometry."""
+
     def run(self) -> int:
         """Prints one table."""
         from delo_jax.cli.console import print_table
 
-        facts = _facts(self.folder)
-        stamps_ns, Ts_estimated = _estimate(self.folder, facts)
-        Ts_true, source = self._truth(facts, stamps_ns)
+        facts = facts_of(self.folder)
+        stamps_ns, Ts_estimated = poses_of(self.folder, facts, "refined_kitti.txt" if self.refined else "poses_kitti.txt")
+        Ts_true, source = true_poses(self.folder, facts, stamps_ns, self.truth)
         if len(Ts_true) != len(Ts_estimated):
             raise DatasetError(
                 f"{source}: expected one pose for each of {len(Ts_estimated)} frames, got {len(Ts_true)}; give the truth of this run"
@@ -44,53 +47,26 @@ class Eval(Command):
         print_table("errors", ("", "translation", "", "rotation", ""), _table(Ts_estimated, Ts_true), right=(1, 3))
         return 0
 
-    def _truth(self, facts: dict[str, Any], stamps_ns: np.ndarray) -> tuple[np.ndarray, str]:
-        """True sensor poses of the run's frames, and where they are from."""
-        from delo_jax.data.dataset import open_dataset
 
-        own = self.folder / "truth.tum"
-        if self.truth is not None or own.exists():
-            path = self.truth or own
-            return _read_truth(path, facts, stamps_ns), str(path)
-        dataset = facts.get("dataset") or {}
-        if not dataset.get("path"):
-            raise DatasetError(f"{self.folder}: expected a truth, got none in the run; give one by --truth")
-        found = open_dataset(dataset["path"], sequence=dataset.get("sequence"))
-        if found.truth is None:
-            raise DatasetError(f"{dataset['path']}: expected a truth beside the scans, got none; give one by --truth")
-        return found.truth[: len(stamps_ns)], found.truth_source  # an interrupted run has fewer frames
+def true_poses(folder: Path, facts: dict[str, Any], stamps_ns: np.ndarray, given: Path | None = None) -> tuple[np.ndarray, str]:
+    """True sensor poses of a run's frames, and where they are from: a file, or the truth of the run's own dataset.
 
+    Raises:
+        DatasetError: there is none.
+    """
+    from delo_jax.data.dataset import open_dataset
 
-def _facts(folder: Path) -> dict[str, Any]:
-    try:
-        facts = json.loads((folder / "run.json").read_text())
-    except OSError as error:
-        raise DatasetError(
-            f"{folder}: expected the folder of a run, got no readable run.json in it ({error.strerror}); check the path"
-        ) from error
-    except ValueError as error:
-        raise DatasetError(f"{folder / 'run.json'}: expected JSON, got {error}; run again") from error
-    if not isinstance(facts, dict):
-        raise DatasetError(f"{folder / 'run.json'}: expected a table, got {type(facts).__name__}; run again")
-    return facts
-
-
-def _estimate(folder: Path, facts: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps and sensor poses of a run; a kill between two files leaves one a frame longer."""
-    from delo_jax.data.poses import read_kitti_poses, read_tum
-
-    poses = _to_lidar(read_kitti_poses(folder / "poses_kitti.txt"), facts)
-    stamps_ns, _ = read_tum(folder / "trajectory.tum")
-    count = min(len(poses), len(stamps_ns))
-    return stamps_ns[:count], poses[:count]
-
-
-def _to_lidar(poses: np.ndarray, facts: dict[str, Any]) -> np.ndarray:
-    """Sensor poses of the rows of a KITTI file that is in the frame of the run's own."""
-    from delo_jax.data.poses import camera_to_lidar
-
-    T_cam_lidar = facts.get("T_cam_lidar")
-    return poses if T_cam_lidar is None else camera_to_lidar(poses, np.array(T_cam_lidar, np.float64))
+    own = folder / "truth.tum"
+    if given is not None or own.exists():
+        path = given or own
+        return _read_truth(path, facts, stamps_ns), str(path)
+    dataset = facts.get("dataset") or {}
+    if not dataset.get("path"):
+        raise DatasetError(f"{folder}: expected a truth, got none in the run; give one by --truth")
+    found = open_dataset(dataset["path"], sequence=dataset.get("sequence"))
+    if found.truth is None:
+        raise DatasetError(f"{dataset['path']}: expected a truth beside the scans, got none; give one by --truth")
+    return found.truth[: len(stamps_ns)], found.truth_source  # an interrupted run has fewer frames
 
 
 def _read_truth(path: Path, facts: dict[str, Any], stamps_ns: np.ndarray) -> np.ndarray:
@@ -100,7 +76,7 @@ def _read_truth(path: Path, facts: dict[str, Any], stamps_ns: np.ndarray) -> np.
     lines = [line.split() for line in read_text(path).splitlines()]
     first = next((words for words in lines if words and not words[0].startswith("#")), [])
     if len(first) != 8:
-        poses = _to_lidar(read_kitti_poses(path), facts)
+        poses = to_lidar(read_kitti_poses(path), facts)
         return poses if facts.get("state") == "complete" else poses[: len(stamps_ns)]  # an interrupted run has fewer frames
     true_ns, poses = read_tum(path)
     order = np.argsort(true_ns, kind="stable")

@@ -39,6 +39,10 @@ class Run(Command):
     """local: scans are registered to a map of what was seen lately; none: to the last scan, by the network alone."""
     deskew: Literal["auto", "on", "off"] = "auto"
     """Undo the motion within a sweep. auto: where points carry times; on: also by azimuth, for scans as measured."""
+    refine: bool = False
+    """Also register frames two and four apart, smooth the poses in a second thread, and solve the whole pose graph at the end."""
+    stamp_sigma_ms: float = 1.0
+    """Standard deviation of the scans' stamps; on the map it is part of the covariance. 0 for stamps that are exact."""
     no_elevation_correction: bool = False
     """Leave out the 0.205 deg that KITTI's scans need; other scans are never changed."""
 
@@ -60,6 +64,8 @@ class Run(Command):
             weights=self.weights,
             use_map=self.map == "local",
             deskew=self.deskew != "off",
+            refine=self.refine,
+            stamp_sigma_s=1e-3 * self.stamp_sigma_ms,
             stage="read",
             facts=self._facts(dataset, deskew),
         )
@@ -82,7 +88,7 @@ class Run(Command):
 def conclude(job: "Job", result: "Result") -> int:
     """Prints the end of a run and returns its exit code."""
     from delo_jax.cli.console import print_summary
-    from delo_jax.cli.summary import rejected_lines, run_rows
+    from delo_jax.cli.summary import refinement_rows, rejected_lines, run_rows
 
     trajectory, total = result.trajectory, len(job.source)
     lines = rejected_lines(result, job.source.paths)
@@ -90,6 +96,8 @@ def conclude(job: "Job", result: "Result") -> int:
         print(f"rejected: {line}")
     if len(trajectory):
         print_summary(run_rows(result))
+    if result.refinement is not None:
+        print_summary(refinement_rows(result.refinement, trajectory.Ts_world_lidar, result.truth), "pose graph")
     if result.interrupted:
         kept = f"{len(trajectory)} of {total} frames are kept in {job.folder}" if len(trajectory) else "no frame was finished"
         print(f"delo: interrupted; {kept}", file=sys.stderr)

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from delo_jax.cli.console import Row
+from delo_jax.cli.refinement import Refinement
 from delo_jax.cli.tracking import Result, percentiles_ms
-from delo_jax.metrics.ate import relative_errors
+from delo_jax.metrics.ate import absolute_errors, relative_errors
 from delo_jax.metrics.drift import KITTI_LENGTHS_M, Drift, kitti_drift
 
 SHORT_LENGTHS_M = (10.0, 20.0, 30.0, 40.0, 50.0)
@@ -25,6 +26,37 @@ def run_rows(result: Result) -> list[Row]:
     if result.truth is not None and len(trajectory) > 1:
         rows += accuracy_rows(trajectory.Ts_world_lidar, result.truth)
     return rows
+
+
+def refinement_rows(found: Refinement, Ts_before: np.ndarray, Ts_true: np.ndarray | None) -> list[Row]:
+    """What the graph consists of, what it took, and errors before and after."""
+    factors = ", ".join(f"{kind} {count}" for kind, count in found.num_factors.items())
+    result = [Row("factors of the graph", factors)]
+    if found.counts:
+        result.append(Row("pairs of key frames", ", ".join(f"{what} {count}" for what, count in found.counts.most_common())))
+    for what, seconds in (("network passes", found.pass_s), ("smoother", found.smooth_s)):
+        p50, p95 = 1e3 * np.percentile(seconds, [50, 95])
+        result.append(Row(f"{what} a frame, second thread, p50 / p95", f"{p50:.1f} / {p95:.1f}", "ms"))
+    result.append(Row("whole graph", f"{found.solve_s:.2f}", "s"))
+    if Ts_true is not None and len(Ts_true) > 2:
+        result += _errors_of(found, Ts_before, Ts_true)
+    return result
+
+
+def _errors_of(found: Refinement, Ts_before: np.ndarray, Ts_true: np.ndarray) -> list[Row]:
+    poses = {"odometry": Ts_before, "smoothed on the way": found.Ts_online, "refined": found.refined.Ts_world_lidar}
+    names = " / ".join(poses)
+    ates = " / ".join(f"{100 * absolute_errors(Ts, Ts_true).rmse_m:.2f}" for Ts in poses.values())
+    result = [Row(f"ATE: {names}", ates, "cm")]
+    drifts = [drift_where_it_fits(Ts, Ts_true) for Ts in poses.values()]
+    if drifts[0] is not None:
+        span = span_of(drifts[0])
+        for unit, values in (
+            ("%", [drift.t_rel_percent for drift in drifts if drift is not None]),
+            ("deg/100 m", [drift.r_rel_deg_per_100m for drift in drifts if drift is not None]),
+        ):
+            result.append(Row(f"drift over {span}: the same", " / ".join(f"{value:.3f}" for value in values), unit))
+    return result
 
 
 def timing_rows(timing: dict[str, np.ndarray]) -> list[Row]:

@@ -8,6 +8,7 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -19,6 +20,7 @@ import delo_jax
 from delo_jax import inference, weights
 from delo_jax.cli.command import Command
 from delo_jax.cli.console import interruptible, progress, working
+from delo_jax.cli.refinement import Refinement, refine, write
 from delo_jax.config import DeloConfig, to_toml
 from delo_jax.data.fields import RawScan
 from delo_jax.errors import ConfigError, ScanError
@@ -26,6 +28,7 @@ from delo_jax.model.delo import Model
 from delo_jax.pipeline.lidar_odometry import Frame, LidarOdometry
 from delo_jax.pipeline.scan_to_map import compile_steps
 from delo_jax.pipeline.trajectory import RunWriter, Trajectory
+from delo_jax.refine.refiner import Refiner, Tracked
 from delo_jax.report.figures import trajectory_figure
 
 STAGES = ("prepare", "solve", "insert")
@@ -71,6 +74,8 @@ class Job:
     weights: str
     use_map: bool
     deskew: bool
+    refine: bool
+    stamp_sigma_s: float
     stage: str
     """What getting a scan is called in the timing."""
     facts: dict[str, Any]
@@ -87,6 +92,7 @@ class Result(NamedTuple):
     interrupted: bool
     truth: np.ndarray | None
     """Of the frames that were tracked."""
+    refinement: Refinement | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +132,7 @@ def track(job: Job) -> Result:
         DeloError: weights that cannot be used, or a folder that cannot be written.
     """
     params, card = weights.load(job.weights), weights.read_card(job.weights)
-    odometry = LidarOdometry(params, use_map=job.use_map, deskew=job.deskew)
+    odometry = LidarOdometry(params, use_map=job.use_map, deskew=job.deskew, stamp_sigma_s=job.stamp_sigma_s)
     with working("compiling"):
         compile_s = compile_model(params, use_map=job.use_map)
     print(f"compiled in {compile_s:.1f} s")
@@ -138,14 +144,20 @@ def track(job: Job) -> Result:
         writer = RunWriter(job.folder, T_cam_lidar=job.source.T_cam_lidar, timing_names=(job.stage, *STAGES))
     except OSError as error:
         raise ConfigError(f"--out {job.folder}: expected a folder to write to, got {error.strerror}; choose another") from error
-    with writer:
-        acquired, interrupted = _loop(job, odometry, writer)
-    result = _result(job, odometry.trajectory(), acquired, compile_s, interrupted)
+    refiner = Refiner(params) if job.refine else None
+    with writer, refiner or nullcontext():
+        acquired, interrupted = _loop(job, odometry, writer, refiner)
+    trajectory = odometry.trajectory()
+    result = _result(job, trajectory, acquired, compile_s, interrupted)
+    if refiner is not None and len(trajectory) > 1:
+        found = refine(refiner.record, refiner.Ts_world_lidar)
+        write(job.folder, found, trajectory.stamps_ns, job.source.T_cam_lidar)
+        result = result._replace(refinement=found)
     _finish(job, result, facts)
     return result
 
 
-def _loop(job: Job, odometry: LidarOdometry, writer: RunWriter) -> tuple[list[float], bool]:
+def _loop(job: Job, odometry: LidarOdometry, writer: RunWriter, refiner: Refiner | None) -> tuple[list[float], bool]:
     """All frames; the seconds it took to get each scan, and whether Ctrl-C ended it."""
     acquired: list[float] = []
     stamps_ns = job.source.stamps_ns
@@ -160,6 +172,8 @@ def _loop(job: Job, odometry: LidarOdometry, writer: RunWriter) -> tuple[list[fl
             acquired.append(time.perf_counter() - begin)
             frame = _register(odometry, scan, stamp_ns)
             writer.append(frame._replace(timing={job.stage: acquired[-1], **frame.timing}))
+            if refiner is not None:
+                refiner.add(Tracked(frame.since, frame.T_world_lidar, frame.covariance, frame.local, odometry.last_scan))
             bar.advance(task)
     return acquired, False
 
@@ -185,7 +199,7 @@ def _register(odometry: LidarOdometry, scan: RawScan | str, stamp_ns: int | None
 def _result(job: Job, trajectory: Trajectory, acquired: list[float], compile_s: float, interrupted: bool) -> Result:
     timing = {name: np.array([record.timing.get(name, np.nan) for record in trajectory.records]) for name in STAGES}
     truth = None if job.source.truth is None else job.source.truth[: len(trajectory)]
-    return Result(trajectory, {job.stage: np.array(acquired), **timing}, compile_s, interrupted, truth)
+    return Result(trajectory, {job.stage: np.array(acquired), **timing}, compile_s, interrupted, truth, None)
 
 
 def percentiles_ms(seconds: np.ndarray) -> tuple[float, float] | None:

@@ -1,7 +1,7 @@
-"""Whether predicted uncertainty fits the errors that were made: likelihood, coverage, consistency, sparsification, detection."""
+"""Whether predicted uncertainty fits the errors that were made: likelihood, coverage, consistency, sparsification, detection, intervals."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int
 from scipy.stats import norm, rankdata
 
 from delo_jax.errors import DeloError
@@ -83,6 +83,35 @@ def auroc(scores: Float[np.ndarray, " n"], positive: Bool[np.ndarray, " n"]) -> 
     if num in (0, len(ranks)):
         return float("nan")
     return float((ranks[positive].sum() - num * (num + 1) / 2) / (num * (len(ranks) - num)))
+
+
+def block_interval(
+    values: Float[np.ndarray, "n k"], blocks: Int[np.ndarray, " m"], *, level: float = 0.95, num_draws: int = 2000, seed: int = 0
+) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
+    """Ends of the interval that the mean of each column lies in, by a bootstrap over whole blocks of rows (Kuensch 1989).
+
+    Rows that follow each other in time are not independent; blocks that are longer than what ties them together nearly are.
+
+    Args:
+        values: what is averaged, row by row.
+        blocks: number of the block of each row.
+        level: of the interval, in (0, 1).
+        num_draws: resamples.
+        seed: of the resamples.
+
+    Raises:
+        DeloError: unequal lengths, no row, NaN or infinity.
+    """
+    values = _checked(values, "values")
+    if len(values) != len(blocks) or len(values) == 0:
+        raise DeloError(f"blocks: expected a number for each of the {len(values)} rows, at least one, got {len(blocks)}")
+    names, place = np.unique(blocks, return_inverse=True)
+    sums, counts = np.zeros((len(names), values.shape[1])), np.bincount(place)
+    np.add.at(sums, place, values)
+    drawn = np.random.default_rng(seed).multinomial(len(names), np.full(len(names), 1.0 / len(names)), size=num_draws)
+    means = (drawn @ sums) / (drawn @ counts)[:, None]
+    low, high = np.quantile(means, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    return low, high
 
 
 def _squares(errors: np.ndarray, factors: np.ndarray) -> np.ndarray:

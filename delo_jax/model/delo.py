@@ -23,6 +23,12 @@ from delo_jax.ops.knn import knn
 
 T = TypeVar("T")
 
+STREAM_NUMBERS = ("share", "turn_s", "push_s", "heave_s", "heave_pitch", "drift_share", "drift_forward")
+"""Names of the scalars in a model's "stream" variables; `uncertainty.stream` says what they mean."""
+
+GATE_SHAPES = {"sigmas": (101, 6), "ranks": (101,)}
+"""Of the arrays in a model's "gate" variables; `uncertainty.gate` says what they mean."""
+
 
 @runtime_checkable
 class Applicable(Protocol):
@@ -45,7 +51,8 @@ class Model:
     """Weights and the config they belong to. Arrays are leaves, the config is static.
 
     `variables` holds "params", where the preset has batch normalisation its running statistics, "batch_stats", and once it is
-    calibrated the weights of `ops.spread`, "covariance".
+    calibrated the weights of `ops.spread`, "covariance", the numbers of a drive on a map, "stream", and the quantiles
+    of held-out pairs, "gate".
     """
 
     variables: dict[str, Any]

@@ -7,6 +7,7 @@ sensor is turned, the answer turns with it.
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, Key
 
 from delo_jax.geometry.se3 import full_float32
@@ -85,7 +86,35 @@ def negative_log_likelihood(
     units: Float[Array, "6"],
 ) -> Float[Array, ""]:
     """Minus the log density of an error of the pose [nats, up to a constant that the units set]."""
+    squared, log_det = _measured(weights, said, T_target_source, error, units)
+    return 0.5 * squared + log_det
+
+
+@full_float32
+def student_negative_log_likelihood(
+    weights: Weights,
+    said: Float[Array, " i"],
+    T_target_source: Float[Array, "4 4"],
+    error: Float[Array, "6"],
+    units: Float[Array, "6"],
+) -> Float[Array, ""]:
+    """The same under a multivariate Student-t distribution with scale H H^T and the `freedom` of the weights."""
+    squared, log_det = _measured(weights, said, T_target_source, error, units)
+    nu = freedom(weights)
+    constant = gammaln(0.5 * nu) - gammaln(0.5 * (nu + 6.0)) + 3.0 * jnp.log(0.5 * nu)
+    return 0.5 * (nu + 6.0) * jnp.log1p(squared / nu) + log_det + constant
+
+
+def freedom(weights: Weights) -> Float[Array, ""]:
+    """Degrees of freedom, above 2, so that there is a covariance; from the number "freedom" that a Student-t fit has beside the others."""
+    return 2.0 + jnp.exp(weights["freedom"])
+
+
+def _measured(weights, said, T_target_source, error, units):
+    """Squared length of the whitened error and half the log determinant; substitution by hand, since batches of small solves are slow."""
     L = factor(weights, said)
     turned = (motion_frame(T_target_source).T @ error) / units
-    white = jax.scipy.linalg.solve_triangular(L, turned, lower=True)
-    return 0.5 * jnp.sum(white**2) + jnp.sum(jnp.log(jnp.diagonal(L)))
+    white: list = []
+    for row in range(6):
+        white.append((turned[row] - sum((L[row, column] * value for column, value in enumerate(white)), start=0.0)) / L[row, row])
+    return sum(value**2 for value in white), jnp.sum(jnp.log(jnp.diagonal(L)))

@@ -19,7 +19,7 @@ from delo_jax.inference import Estimate, PreparedScan
 from delo_jax.model.delo import Model, Surfaces
 from delo_jax.pipeline.local_map import CROP_M, LocalMap, surfaces_of
 from delo_jax.preprocess import LEAF_SIZE
-from delo_jax.uncertainty import covariance, status
+from delo_jax.uncertainty import covariance, status, stream
 from delo_jax.uncertainty.observability import observability
 
 NUM_LEARNED_POINTS = 512  # the robust steps take all
@@ -40,7 +40,7 @@ RECOVERY_STEPS = 12
 INSERT_M, INSERT_DEG = 1.0, 5.0  # motion since the last insertion
 NUM_RECENT = 20  # scans whose scores say what is usual
 MIN_USUAL_SCORE = 0.35
-SIGMA_M, NUM_INDEPENDENT = 0.02, 100.0  # of a plane distance; as many of them as if they were independent; not calibrated
+SIGMA_M, NUM_INDEPENDENT = 0.02, 100.0  # of a plane distance; as many of them as if they were independent; `stream` has a share of that
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,9 @@ class SweepFix(NamedTuple):
 class Located(NamedTuple):
     """Where a scan is."""
 
-    motion: Estimate  # T_since_current
+    motion: Estimate  # T_since_current; the covariance is the registration's own, of the pose on the map
+    noise: stream.OnMap | None  # calibrated; None where the weights are not, or nothing was found
+    swing: stream.Swing  # with this motion
     scan: PreparedScan  # as it was registered: de-skewed with this motion
     score: float  # as of its fix
 
@@ -206,27 +208,35 @@ def compile_steps(params: Model) -> None:
 class MapTracker:
     """The local map of a drive, how well scans have fitted it lately, and what that says of the next one."""
 
-    def __init__(self, params: Model, steps: Steps):
+    def __init__(self, params: Model, steps: Steps, stamp_sigma_s: float = 0.0):
         require_fine_stage(params)
         self._params, self._steps, self._map = params, steps, LocalMap()
         self._scores: deque[float] = deque(maxlen=NUM_RECENT)
         self._inserted_at: np.ndarray | None = None
+        self._numbers, self._swing = stream.StreamNoise.of(params.variables), stream.STEADY
+        self._stamp_sigma_s = stamp_sigma_s
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the weights say what a pose on the map is off by."""
+        return self._numbers is not None
 
     def restart(self, scan: PreparedScan, T_world_lidar: np.ndarray) -> None:
         """A new map that begins with this scan."""
-        self._map, self._inserted_at = LocalMap(), None
+        self._map, self._inserted_at, self._swing = LocalMap(), None, stream.STEADY
         self._scores.clear()
         self.insert(scan, T_world_lidar)
 
-    def insert(self, scan: PreparedScan, T_world_lidar: np.ndarray) -> None:
-        """Take in a scan, once a metre or so."""
+    def insert(self, scan: PreparedScan, T_world_lidar: np.ndarray) -> bool:
+        """Take in a scan, once a metre or so; whether it was taken in."""
         if self._inserted_at is not None:
             moved = se3.inverse(self._inserted_at) @ T_world_lidar
             if np.linalg.norm(moved[:3, 3]) < INSERT_M and se3.rotation_angle(moved[:3, :3]) < np.radians(INSERT_DEG):
-                return
+                return False
         self._map.insert(surfaces_of(scan.scan), T_world_lidar)
         self._map.prune(T_world_lidar)
         self._inserted_at = T_world_lidar
+        return True
 
     def locate(
         self, scan: PreparedScan, T_world_since: np.ndarray, Ts_since_guess: Sequence[np.ndarray], elapsed_s: float, *, recovering: bool
@@ -245,8 +255,7 @@ class MapTracker:
         skips = (0, NUM_LEARNED_POINTS) if recovering and num_learned else (0,)
         tries = []
         for T_since_guess in Ts_since_guess:
-            near = Surroundings(self._map, T_world_since @ T_since_guess)
-            sweeps = [scan]
+            near, sweeps = Surroundings(self._map, T_world_since @ T_since_guess), [scan]
             if recovering and scan.times_s is not None:  # a guess is a velocity too, unless the sensor was carried
                 sweeps.append(scan.still(se3.log(T_since_guess) / elapsed_s))
             for sweep, skip in itertools.product(sweeps, skips):
@@ -262,13 +271,14 @@ class MapTracker:
         if motion.status == "ok" and np.any(np.abs(change) > UNSTEADY):
             what = f"{np.degrees(np.abs(change[:3]).max()):.0f} deg/s and {np.abs(change[3:]).max():.1f} m/s"
             motion = dataclasses.replace(motion, status="low_confidence", reason=f"the velocity changed by {what} since the last scan")
-        return Located(motion, scan, fix.score)
+        velocity = se3.log(motion.T_target_source) / elapsed_s
+        swing = self._swing.after(velocity) if scan.times_s is not None else stream.STEADY
+        return Located(motion, self._noise(motion, fix, velocity, swing.squares), swing, scan, fix.score)
 
-    def accept(self, located: Located) -> Estimate:
-        """The motion of a scan that stands; its score is one of the usual from now on."""
-        if located.motion.status != "rejected":
-            self._scores.append(located.score)
-        return located.motion
+    def accept(self, located: Located) -> None:
+        """A scan stands where it was located; its score is one of the usual from now on."""
+        self._scores.append(located.score)
+        self._swing = located.swing
 
     def _judged(self, scan: PreparedScan, fix: MapFix, T_expected: np.ndarray, T_since_guess: np.ndarray) -> Estimate:
         """Motion, covariance and status of a fix."""
@@ -278,10 +288,24 @@ class MapTracker:
         seen = observability(fix.information)
         usable = (scan.num_points, max(len(self._map), cfg.min_points))
         health = status.judge(num_points=usable, finite=fix.score > 0.0, confidence=confidence, seen=seen, cfg=cfg)
-        T, known = T_expected, covariance.unknown(cfg)
-        if health.status != "rejected":
-            T = T_since_guess @ fix.T_start_lidar
-            known = covariance.from_information(fix.information, sigma_m=SIGMA_M + fix.rms_m, num_planes=fix.score * NUM_INDEPENDENT)
+        lost = health.status == "rejected"
+        T, known = (T_expected, covariance.unknown(cfg)) if lost else (T_since_guess @ fix.T_start_lidar, _classical(fix))
         if health.status == "degenerate":
             known = covariance.widen(known, seen, cfg)
         return Estimate(T_target_source=T, **known._asdict(), status=health.status, confidence=health.confidence, reason=health.reason)
+
+    def _noise(self, motion: Estimate, fix: MapFix, velocity: np.ndarray, squares: np.ndarray) -> stream.OnMap | None:
+        """Calibrated; with what the sensor may have moved by between the stamp and the scan.
+
+        What was added along directions that nothing holds is not known of the map either.
+        """
+        if self._numbers is None or motion.status == "rejected":
+            return None
+        classical, way_m = _classical(fix).covariance, float(np.linalg.norm(motion.T_target_source[:3, 3]))
+        noise = stream.noise_on_map(self._numbers, classical, squares, way_m)
+        moved = self._stamp_sigma_s**2 * np.outer(velocity, velocity)
+        return noise._replace(local=noise.local + moved, step=noise.step + motion.covariance - classical)
+
+
+def _classical(fix: MapFix) -> covariance.Uncertainty:
+    return covariance.from_information(fix.information, sigma_m=SIGMA_M + fix.rms_m, num_planes=fix.score * NUM_INDEPENDENT)

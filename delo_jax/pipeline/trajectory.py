@@ -1,6 +1,7 @@
 """The trajectory of a run: kept in memory, saved as a whole, or written to files frame by frame.
 
-Frames are read by attribute: T_world_lidar, stamp_ns, status, timing and motion, whose covariance, confidence and reason are kept.
+Frames are read by attribute: T_world_lidar, covariance, local, stamp_ns, status, timing and motion, whose covariance, confidence and
+reason are kept.
 """
 
 import csv
@@ -18,6 +19,8 @@ from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.data.poses import format_kitti_pose, format_seconds, lidar_to_camera
 from delo_jax.errors import DeloError
 
+COVARIANCES = ("covariances", "pose_covariances", "local_covariances")
+"""Files of a run: of the motions, of the poses, and the part of these that later poses do not inherit."""
 COLUMNS = ("index", "since_index", "stamp_ns", "status", "reason", "confidence")
 SIGMA_COLUMNS = ("sigma_rx_deg", "sigma_ry_deg", "sigma_rz_deg", "sigma_x_m", "sigma_y_m", "sigma_z_m")
 
@@ -36,6 +39,10 @@ class FrameRecord(NamedTuple):
     confidence: float
     covariance: Float64[np.ndarray, "6 6"]
     """Of the motion from frame `since` to this one, order [omega, v]."""
+    pose_covariance: Float64[np.ndarray, "6 6"]
+    """Of T_world_lidar, order [omega, v]."""
+    local_covariance: Float64[np.ndarray, "6 6"]
+    """The part of it that later poses do not inherit."""
     timing: dict[str, float]
     """Stage to seconds."""
 
@@ -51,6 +58,8 @@ class FrameRecord(NamedTuple):
             reason=str(frame.motion.reason or ""),
             confidence=float(frame.motion.confidence),
             covariance=np.array(frame.motion.covariance, dtype=np.float64),
+            pose_covariance=np.array(frame.covariance, dtype=np.float64),
+            local_covariance=np.array(frame.local, dtype=np.float64),
             timing=dict(frame.timing or {}),
         )
 
@@ -101,7 +110,7 @@ def _csv_line(cells: Sequence[object]) -> str:
 
 
 class Trajectory:
-    """The frames of a run so far: about a kilobyte each, never a scan."""
+    """The frames of a run so far: about two kilobytes each, never a scan."""
 
     def __init__(self, frames: Iterable[Any] = ()):
         self.records: list[FrameRecord] = []
@@ -140,6 +149,16 @@ class Trajectory:
     def covariances(self) -> Float64[np.ndarray, "n 6 6"]:
         """Covariance of every motion, order [omega, v]."""
         return np.array([record.covariance for record in self.records]).reshape(-1, 6, 6)
+
+    @property
+    def pose_covariances(self) -> Float64[np.ndarray, "n 6 6"]:
+        """Covariance of every pose in the world, order [omega, v]."""
+        return np.array([record.pose_covariance for record in self.records]).reshape(-1, 6, 6)
+
+    @property
+    def local_covariances(self) -> Float64[np.ndarray, "n 6 6"]:
+        """The part of them that later poses do not inherit."""
+        return np.array([record.local_covariance for record in self.records]).reshape(-1, 6, 6)
 
     @property
     def sigmas(self) -> Float64[np.ndarray, "n 6"]:
@@ -202,8 +221,8 @@ class CovarianceFile:
 class RunWriter:
     """Writes a run's files frame by frame, so that a run that was interrupted or killed leaves whole frames behind.
 
-    poses_kitti.txt, trajectory.tum, frames.csv and covariances.npy are started anew; each frame adds one row to each of them, in one
-    unbuffered write. After a kill between two of these writes the files differ by that one frame.
+    poses_kitti.txt, trajectory.tum, frames.csv and the three covariance files are started anew; each frame adds one row to each of them,
+    in one unbuffered write. After a kill between two of these writes the files differ by that one frame.
 
     Args:
         out_dir: the run's folder, made if missing.
@@ -223,7 +242,7 @@ class RunWriter:
         self.kitti_frame = "lidar" if T_cam_lidar is None else "camera"
         self.num_frames = 0
         self._T_cam_lidar, self._timing_names = T_cam_lidar, tuple(timing_names)
-        self._covariances = CovarianceFile(folder / "covariances.npy")
+        self._covariances = [CovarianceFile(folder / f"{name}.npy") for name in COVARIANCES]
         self._kitti, self._tum, self._csv = (_open(folder / name) for name in ("poses_kitti.txt", "trajectory.tum", "frames.csv"))
         self._csv.write(csv_header(self._timing_names).encode())
 
@@ -235,14 +254,18 @@ class RunWriter:
         """
         record = FrameRecord.of(frame, self.num_frames)
         rows = kitti_row(record, self._T_cam_lidar), tum_row(record), csv_row(record, self._timing_names)
-        self._covariances.append(record.covariance)
+        matrices = record.covariance, record.pose_covariance, record.local_covariance
+        for store, covariance in zip(self._covariances, matrices, strict=True):
+            store.append(covariance)
         for file, row in zip((self._kitti, self._tum, self._csv), rows, strict=True):
             file.write(row.encode())
         self.num_frames += 1
 
     def close(self) -> None:
         """Closes the files."""
-        for file in (self._covariances, self._kitti, self._tum, self._csv):
+        for store in self._covariances:
+            store.close()
+        for file in (self._kitti, self._tum, self._csv):
             file.close()
 
     def __enter__(self) -> "RunWriter":

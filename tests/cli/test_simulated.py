@@ -31,7 +31,7 @@ sys.exit(main(sys.argv[1:]))
 def test_demo_opens_no_socket(weights_file, tmp_path):
     """Oracle: an audit hook of a fresh interpreter that sees every socket; the simulator's truth is beside the estimate."""
     out = tmp_path / "demo"
-    argv = ["demo", "--out", str(out), "--num-scans", "12", "--weights", weights_file]
+    argv = ["demo", "--out", str(out), "--num-scans", "5", "--weights", weights_file]
     run = subprocess.run([sys.executable, "-W", "error", "-c", WITHOUT_SOCKETS, *argv], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     assert "error of a step" in run.stdout
@@ -42,9 +42,9 @@ def test_demo_opens_no_socket(weights_file, tmp_path):
     with (out / "frames.csv").open(newline="") as file:
         assert {"simulate_ms", "prepare_ms", "solve_ms"} <= set(next(csv.DictReader(file)))
     estimate, truth = np.loadtxt(out / "trajectory.tum"), np.loadtxt(out / "truth.tum")
-    assert len(estimate) == len(truth) == 12
+    assert len(estimate) == len(truth) == 5
     np.testing.assert_array_equal(estimate[:, 0], truth[:, 0])
-    drive = list(sim.simulate_drive("urban", DRIVE_SEED + 63, 12, rolling_shutter=True))
+    drive = list(sim.simulate_drive("urban", DRIVE_SEED + 63, 5, rolling_shutter=True))
     T_first_last = np.linalg.inv(drive[0].T_world_lidar) @ drive[-1].T_world_lidar
     np.testing.assert_allclose(truth[-1, 1:4], T_first_last[:3, 3], atol=1e-8)
 

@@ -7,7 +7,7 @@ from scipy.stats import chi2, multivariate_normal
 from sklearn.metrics import roc_auc_score
 
 from delo_jax.errors import DeloError
-from delo_jax.metrics.calibration import auroc, coverage, nees, negative_log_likelihood, sparsification_error
+from delo_jax.metrics.calibration import auroc, block_interval, coverage, nees, negative_log_likelihood, sparsification_error
 
 
 def gaussian(seed, n=400, k=6):
@@ -73,6 +73,17 @@ def test_detection_is_that_of_scikit_learn(seed):
     assert np.isnan(auroc(scores, np.zeros(200, bool)))
 
 
+@pytest.mark.parametrize("length", [1, 10])
+def test_interval_of_a_mean_of_rows_that_come_in_blocks(length):
+    """Oracle: the standard error of the mean of independent draws, each of which stands `length` times in a row."""
+    rng = np.random.default_rng(length)
+    draws = rng.normal(size=(400, 2)) * np.array([1.0, 3.0])
+    low, high = block_interval(np.repeat(draws, length, axis=0), np.repeat(np.arange(400), length))
+    half = 1.96 * draws.std(axis=0) / np.sqrt(400)
+    np.testing.assert_allclose(low, draws.mean(axis=0) - half, atol=0.2 * half.min())
+    np.testing.assert_allclose(high, draws.mean(axis=0) + half, atol=0.2 * half.min())
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -82,6 +93,7 @@ def test_detection_is_that_of_scikit_learn(seed):
         (lambda e, C: coverage(e, np.zeros_like(e), 0.5), "sigmas: expected values above 0"),
         (lambda e, C: coverage(e, np.ones((3, 6)), 0.5), "sigmas: expected the shape of errors"),
         (lambda e, C: sparsification_error(e[:, 0], np.ones(3)), "sigmas: expected as many as errors"),
+        (lambda e, C: block_interval(e, np.zeros(3, int)), "blocks: expected a number for each of the 10 rows"),
     ],
 )
 def test_what_cannot_be_measured_is_said(call, message):

@@ -139,6 +139,12 @@ def test_jit_and_vmap(solver):
     assert_transforms_agree(lambda *data: pose_of_costs(*data, cfg=cfg)[:4], *batches, rtol=1e-3, atol=1e-3)
 
 
+@functools.cache
+def pose_of_plan(solver):
+    """Plan to pose by one of the solvers."""
+    return jax.jit(functools.partial(coarse_pose, cfg=PoseConfig(solver=solver)))
+
+
 def exact(solver, seed, num_matched=40):
     """A one-hot plan of some key points, the clouds, the mask, and T_target_source: any motion, or one in the plane."""
     rng = np.random.default_rng(seed)
@@ -163,7 +169,7 @@ def test_one_hot_plan_gives_the_motion(solver, seed):
     40 of 50 key points are matched; what the others would say is of no weight, or a robust one.
     """
     data, mask, plan, order, T_true = exact(solver, seed)
-    found = jax.jit(functools.partial(coarse_pose, cfg=PoseConfig(solver=solver)))(*data, mask)
+    found = pose_of_plan(solver)(*data, mask)
     translation, rotation = errors(found.T_target_source, T_true)
     assert translation < (1e-4 if solver != "consistency" else 1e-3)
     assert rotation < (1e-3 if solver != "consistency" else 1e-2)

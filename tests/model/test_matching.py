@@ -1,6 +1,7 @@
 """From descriptors to a plan: each formulation calls its formula with the documented weights."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -27,15 +28,22 @@ def descriptors(seed=0):
     return *(jnp.asarray(rows, jnp.float32) for rows in (source, target)), jnp.arange(N) < 10, jnp.arange(M) < 13
 
 
+@functools.cache
+def initial(cfg):
+    """Variables as they are drawn."""
+    return jax.jit(Matcher(cfg).init)(jax.random.key(0), *descriptors())
+
+
 def variables_of(cfg, **params):
     """Initial weights, some replaced."""
-    variables = Matcher(cfg).init(jax.random.key(0), *descriptors())
+    variables = initial(cfg)
     return {"params": {**variables.get("params", {}), **{name: jnp.asarray(value) for name, value in params.items()}}}
 
 
-def apply(cfg, *arguments, **method):
+@functools.partial(jax.jit, static_argnames=("cfg", "method"))
+def apply(cfg, *arguments, method=None):
     """The matcher's answer."""
-    answer: Any = Matcher(cfg).apply(*arguments, **method)
+    answer: Any = Matcher(cfg).apply(*arguments, method=method)
     return answer
 
 
@@ -106,6 +114,13 @@ def test_learned_epsilon_starts_where_it_is_told(epsilon):
     np.testing.assert_allclose(found, epsilon, rtol=1e-5)
 
 
+@jax.jit
+@jax.value_and_grad
+def sharpness_and_slope(variables, *arguments):
+    """Sum of squares of the plan of a learned epsilon, by the weights."""
+    return jnp.sum(apply(LEARNED, variables, *arguments) ** 2)
+
+
 @pytest.mark.parametrize("raw", [-1e30, -100.0, -1.0, 0.0, 3.0, 1e4])
 def test_learned_epsilon_is_above_its_floor(raw):
     """Oracle: softplus in float64 above the floor; a plan of numbers, with a slope that is one."""
@@ -114,10 +129,7 @@ def test_learned_epsilon_is_above_its_floor(raw):
     found = apply(LEARNED, variables, method="epsilon")
     np.testing.assert_allclose(found, MIN_EPSILON + np.logaddexp(0.0, raw), rtol=1e-6)
 
-    def total(variables):
-        return jnp.sum(apply(LEARNED, variables, source, target, *masks) ** 2)
-
-    value, slope = jax.value_and_grad(total)(variables)
+    value, slope = sharpness_and_slope(variables, source, target, *masks)
     assert np.isfinite(value)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
 
@@ -181,6 +193,17 @@ def test_sparse_plan_is_the_dense_one_on_its_candidates(num_candidates):
     assert np.all(np.count_nonzero(found, axis=1) <= num_candidates)
 
 
+@functools.cache
+def slopes_and_plan(cfg):
+    """Slopes of the plan's total by weights and source, and the plan."""
+
+    def total(variables, source, target, *masks):
+        plan = apply(cfg, variables, source, target, *masks)
+        return jnp.sum(plan), plan
+
+    return jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))
+
+
 @pytest.mark.parametrize("plan", PLANS)
 @pytest.mark.parametrize("valid", [(0, 0), (0, M), (N, 0), (1, 1)])
 def test_nothing_to_match_is_finite(plan, valid):
@@ -188,13 +211,7 @@ def test_nothing_to_match_is_finite(plan, valid):
     cfg = dataclasses.replace(CFG, plan=plan, learn_epsilon=True, predict_mass=plan in WITH_MASS)
     source, target, *_ = descriptors()
     masks = jnp.arange(N) < valid[0], jnp.arange(M) < valid[1]
-    variables = variables_of(cfg)
-
-    def total(variables, source):
-        plan = apply(cfg, variables, source, target, *masks)
-        return jnp.sum(plan), plan
-
-    slopes, found = jax.grad(total, argnums=(0, 1), has_aux=True)(variables, source)
+    slopes, found = slopes_and_plan(cfg)(variables_of(cfg), source, target, *masks)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((slopes, found)))
     assert np.all(np.asarray(found)[valid[0] :] == 0)
     assert np.all(np.asarray(found)[:, valid[1] :] == 0)

@@ -100,6 +100,7 @@ def test_one_pair_at_a_time_or_several():
         one = solve(*pair)
         np.testing.assert_allclose(batch.T_target_source[k], one.T_target_source, atol=2e-3)
         np.testing.assert_allclose(batch.statistics[k], one.statistics, atol=0.2)  # in standard deviations
+        np.testing.assert_allclose(batch.confidence[k], one.confidence, atol=1e-3)
         assert batch.used_coarse[k] == one.used_coarse
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, multivariate_t
 
 from delo_jax.ops import spread
 from delo_jax.ops.evidence import NIG, moments
@@ -34,6 +34,19 @@ def test_likelihood_is_that_of_the_covariance(seed):
     expected = -multivariate_normal(np.zeros(6), H @ H.T).logpdf(np.asarray(error))
     constant = 3 * np.log(2 * np.pi) + np.log(np.asarray(UNITS, np.float64)).sum()
     assert float(spread.negative_log_likelihood(weights, said, T, error, UNITS)) + constant == pytest.approx(expected, rel=1e-4, abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_likelihood_of_heavy_tails(seed):
+    """Oracle: scipy.stats.multivariate_t with the shape H H^T and the degrees of freedom."""
+    weights, said, T, error = problem(seed)
+    weights["freedom"] = jnp.array(0.5 * seed)
+    H = np.asarray(spread.half(weights, said, T, UNITS), np.float64)
+    assert float(spread.freedom(weights)) == pytest.approx(2.0 + np.exp(0.5 * seed), rel=1e-6)
+    expected = -multivariate_t(np.zeros(6), H @ H.T, df=2.0 + np.exp(0.5 * seed)).logpdf(np.asarray(error))
+    constant = 3 * np.log(np.pi) + 3 * np.log(2.0) + np.log(np.asarray(UNITS, np.float64)).sum()
+    found = float(spread.student_negative_log_likelihood(weights, said, T, error, UNITS))
+    assert found + constant == pytest.approx(expected, rel=1e-4, abs=1e-3)
 
 
 @pytest.mark.parametrize("yaw", [0.3, -2.0, np.pi])

@@ -17,7 +17,8 @@ from delo_jax.pipeline.trajectory import CovarianceFile, RunWriter, Trajectory
 
 ROOT = Path(__file__).parents[2]
 STAGES = ("prepare", "solve")
-FILES = ("poses_kitti.txt", "trajectory.tum", "frames.csv", "covariances.npy")
+COVARIANCES = ("covariances.npy", "pose_covariances.npy", "local_covariances.npy")
+FILES = ("poses_kitti.txt", "trajectory.tum", "frames.csv", *COVARIANCES)
 EPOCH_NS = 1_317_384_506_123_456_789  # float64 seconds would lose its last digits
 
 
@@ -30,7 +31,8 @@ def make_frame(index, *, status="ok", reason="", stamp_ns=None, since=None):
     motion = SimpleNamespace(covariance=np.diag(np.square(sigmas)) * (index + 1), confidence=0.75, status=status, reason=reason)
     timing = {"prepare": 0.0125} if index == 0 else {"prepare": 0.0125, "solve": 0.0075}
     since = max(index - 1, 0) if since is None else since
-    return SimpleNamespace(T_world_lidar=T_world_lidar, motion=motion, since=since, status=status, stamp_ns=stamp_ns, timing=timing)
+    known = {"T_world_lidar": T_world_lidar, "covariance": 2.0 * motion.covariance, "local": 0.5 * motion.covariance}
+    return SimpleNamespace(**known, motion=motion, since=since, status=status, stamp_ns=stamp_ns, timing=timing)
 
 
 @pytest.fixture
@@ -115,6 +117,8 @@ def test_writer_leaves_the_files_that_saving_at_the_end_would(frames, T_cam_lida
     for name in FILES[:3]:
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / name).read_bytes()
     np.testing.assert_array_equal(np.load(tmp_path / "run" / "covariances.npy"), [frame.motion.covariance for frame in frames])
+    np.testing.assert_array_equal(np.load(tmp_path / "run" / "pose_covariances.npy"), [frame.covariance for frame in frames])
+    np.testing.assert_array_equal(np.load(tmp_path / "run" / "local_covariances.npy"), [frame.local for frame in frames])
 
 
 def test_unannounced_stage_is_refused_and_nothing_written(frames, tmp_path):
@@ -171,4 +175,4 @@ def num_whole_frames(run):
     assert kitti.shape[1] == 12
     assert tum.shape[1] == 8
     assert {len(row) for row in table} == {len(header)}
-    return dict(zip(FILES, (len(kitti), len(tum), len(table), len(np.load(run / "covariances.npy"))), strict=True))
+    return dict(zip(FILES, (len(kitti), len(tum), len(table), *(len(np.load(run / name)) for name in COVARIANCES)), strict=True))

@@ -1,11 +1,13 @@
 """Covariances fitted to errors."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from delo_jax.metrics.calibration import coverage, nees
 from delo_jax.model import delo
+from delo_jax.ops import spread
 from delo_jax.ops.evidence import NIG
 from delo_jax.train import calibrate as module
 from delo_jax.train.presets import PRESETS
@@ -61,6 +63,32 @@ def test_fit_finds_the_covariances_that_the_errors_were_drawn_from(model, monkey
     assert calibrated.cfg.evidence.covariance_width == module.WIDTH
 
 
+def test_scale_is_between_what_two_levels_ask_for_and_leaves_the_first_nearly_right():
+    """Oracle: quantiles of drawn errors; those of heavy tails (Student-t, 3 degrees of freedom) are not to fill more than 72 % at 68 %."""
+    rng = np.random.default_rng(0)
+    errors = np.column_stack([rng.normal(size=(20_000, 3)) * [1.0, 2.0, 0.5], rng.standard_t(3, (20_000, 3)) * [1.0, 1.5, 0.1]])
+    scale = module._scale(errors, np.tile(np.eye(6), (len(errors), 1, 1)))
+    np.testing.assert_allclose(scale[:3], [1.0, 2.0, 0.5], rtol=0.02)
+    inside = coverage(errors, np.tile(scale, (len(errors), 1)), 0.68)
+    np.testing.assert_allclose(inside[3:], 0.72, atol=0.003)
+    assert (coverage(errors, np.tile(scale, (len(errors), 1)), 0.95)[3:] > 0.9).all()
+
+
+@pytest.mark.parametrize("freedom", [4.0])
+def test_student_fit_finds_the_degrees_of_freedom(model, monkeypatch, freedom):
+    """Oracle: the construction: Gaussian errors over the root of a chi-squared number, shared by the axes."""
+    monkeypatch.setattr(module, "MAX_STEPS", 60)
+    pairs, covariances = drawn(0, 4400)
+    rng = np.random.default_rng(1)
+    heavy = pairs._replace(errors=pairs.errors * np.sqrt(freedom / rng.chisquare(freedom, (len(pairs.errors), 1))))
+    heavy = heavy.rows(np.flatnonzero(~heavy.lost(model)))
+    weights = module.fit(model, heavy, likelihood=spread.student_negative_log_likelihood, more={"freedom": jnp.array(2.0)})
+    assert float(spread.freedom(weights)) == pytest.approx(freedom, rel=0.25)
+    H = module.halves(model, weights, pairs)
+    sigma, true = (np.sqrt(np.diagonal(C, axis1=1, axis2=2)) for C in (H @ H.transpose(0, 2, 1), covariances))
+    assert np.median(np.abs(np.log(sigma / true))) < 0.2
+
+
 def test_pairs_of_a_world_are_solved_and_measured(model, monkeypatch):
     """Oracle: two worlds of one scan seen again and again: the truth of every pair is the identity."""
     from delo_jax.preprocess import Scan, preprocess
@@ -72,6 +100,7 @@ def test_pairs_of_a_world_are_solved_and_measured(model, monkeypatch):
     monkeypatch.setattr(module, "FRAMES", ((0, 1), (5, 2)))
     pairs = module.solved_pairs(model, [world, world])
     assert pairs.errors.shape == (4, 6)
+    assert module.solved_pairs(model, [world], ((2, 4),)).gaps.tolist() == [2]
     np.testing.assert_array_equal(pairs.worlds, [0, 0, 1, 1])
     np.testing.assert_array_equal(pairs.gaps, [1, -3, 1, -3])
     for error, T in zip(pairs.errors, pairs.Ts_target_source, strict=True):

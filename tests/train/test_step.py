@@ -15,7 +15,7 @@ from delo_jax.train.loop import phases
 from delo_jax.train.pairs import random_pair
 from delo_jax.train.presets import PRESETS
 from delo_jax.train.step import PairBatch, make_optimizer, make_schedule, make_train_step
-from tests.fixtures import TINY_TRAINING, narrow, narrow_model, street_world, tiny_model
+from tests.fixtures import QUICKLY, TINY_TRAINING, narrow, narrow_model, street_world, tiny_model
 
 CFG = dataclasses.replace(TINY_TRAINING, num_steps=60, num_evidence_steps=60, learning_rate=5e-3)
 POSE = {"encoder", "matcher", "point_embedding", "edge_network"}
@@ -166,6 +166,7 @@ def test_evidence_learned_apart_moves_its_head_alone():
     """Oracle: the bytes of all other weights and running statistics."""
     _, tx, train_step = paper(apart=True)
     state = paper_start(tx)
+    train_step = train_step.lower(state, paper_batch()).compile(QUICKLY)
     for _ in range(3):
         state, metrics = train_step(state, paper_batch())
     assert metrics.keys() == {"loss", "grad_norm", "evidence"}
@@ -226,7 +227,8 @@ def test_other_presets_take_a_step(preset, pose_loss):
     cfg = dataclasses.replace(narrow(preset), pose_loss=pose_loss)
     tx = make_optimizer(cfg, 100)
     state = module.start(jax.tree.map(jnp.array, narrow_model(preset).variables), tx)
-    state, metrics = make_train_step(cfg, tx)(state, paper_batch())
+    train_step = make_train_step(cfg, tx).lower(state, paper_batch()).compile(QUICKLY)
+    state, metrics = train_step(state, paper_batch())
     assert metrics.keys() == {"loss", "grad_norm", "pose", "aux"} | ({"evidence"} if preset == "official" else set())
     assert all(np.isfinite(value) for value in metrics.values())
     assert int(state.num_nonfinite) == 0
@@ -236,7 +238,8 @@ def test_plan_can_be_trained_in_place_of_scores():
     """Oracle: gradient descent on a fixed batch must descend; the first phase of the tiny network with the loss of its plan."""
     cfg = dataclasses.replace(phases(CFG, 60)[0][0], matching_loss="plan", matching_weight=1.0, fine_weight=0.0)
     tx = make_optimizer(cfg, 60)
-    train_step, state, losses = make_train_step(cfg, tx), start(tx), []
+    state, losses = start(tx), []
+    train_step = make_train_step(cfg, tx).lower(state, batch(*pairs())).compile(QUICKLY)
     for _ in range(20):
         state, metrics = train_step(state, batch(*pairs()))
         losses.append(float(metrics["loss"]))
