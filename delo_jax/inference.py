@@ -19,7 +19,7 @@ from delo_jax.uncertainty.observability import observability
 encode = jax.jit(delo.encode)
 solve = jax.jit(delo.solve)
 fine_step = jax.jit(delo.fine_step)
-covariance_half = jax.jit(delo.covariance_half)
+pair_covariance = jax.jit(delo.covariance)
 robust_steps = jax.jit(robust_point_to_plane, static_argnames=("scale_m", "reach_m", "num_steps"))
 sweep_steps = jax.jit(robust_sweep_to_plane, static_argnames=("scale_m", "reach_m", "num_steps", "sigma_velocity", "sigma_m"))
 
@@ -124,8 +124,8 @@ def align(params: delo.Model, source: PreparedScan, target: PreparedScan, T_targ
     limits = params.cfg.status
     start = np.asarray(T_target_source_init, np.float64)
     solved = solve(params, source.encoding, target.encoding, jnp.asarray(start, jnp.float32))
-    half = covariance_half(params, solved) if params.cfg.evidence.covariance_width else None
-    result, half = jax.device_get((solved, half))
+    spread = pair_covariance(params, solved) if params.cfg.evidence.covariance_width else None
+    result, spread = jax.device_get((solved, spread))
     seen = observability(result.information) if result.finite else observability(np.zeros((6, 6)))
     head = params.cfg.evidence.head
     health = status.judge(
@@ -139,8 +139,8 @@ def align(params: delo.Model, source: PreparedScan, target: PreparedScan, T_targ
     if health.status != "rejected":
         nig = [np.asarray(value, np.float64) for value in result.nig]
         T = se3.orthonormal(np.asarray(result.T_target_source, np.float64))
-        if half is not None:
-            known = covariance.from_half(np.asarray(half, np.float64), nig[1])
+        if spread is not None:
+            known = covariance.from_half(np.asarray(spread.half, np.float64), float(spread.doubt))
         elif head == "statistics":
             known = covariance.from_evidence(*nig)
         elif head == "embedding":

@@ -50,13 +50,13 @@ def solved(model: Model, source: PreparedScan, target: PreparedScan, T_true: np.
     """A pair from the identity, without a motion prior; of scans with too few points nothing is known."""
     limits = model.cfg.status
     result = inference.solve(model, source.encoding, target.encoding, jnp.eye(4))
-    result, half = jax.device_get((result, inference.covariance_half(model, result)))
+    result, (half, doubt) = jax.device_get((result, inference.pair_covariance(model, result)))
     nothing = np.full(6, np.inf)
     if not result.finite or min(source.num_points, target.num_points) < limits.min_points:
         return Said(nothing, 0.0, *[covariance.unknown(limits)] * 2)
     T, nig = se3.orthonormal(np.asarray(result.T_target_source, np.float64)), [np.asarray(array, np.float64) for array in result.nig]
     error = nothing if T_true is None else se3.log(se3.inverse(T) @ T_true)
-    full = covariance.from_half(np.asarray(half, np.float64), nig[1])
+    full = covariance.from_half(np.asarray(half, np.float64), float(doubt))
     return Said(error, float(result.confidence), covariance.from_evidence(*nig), full)
 
 

@@ -57,7 +57,7 @@ def as_bytes(estimate):
 def test_a_pair_without_points_compiles_everything_that_a_good_one_needs():
     """Oracle: the sizes of the caches, with the released weights, which are calibrated."""
     params, nothing = delo_jax.load("delo-base"), np.zeros((0, 3), np.float32)
-    functions: tuple[Any, ...] = (inference.encode, inference.solve, inference.covariance_half)
+    functions: tuple[Any, ...] = (inference.encode, inference.solve, inference.pair_covariance)
     assert odometry(params, nothing, nothing).status == "rejected"
     sizes = [function._cache_size() for function in functions]
     estimate = odometry(params, *(street.scan(street.pose(x), noise_m=0.02, seed=2).points for x in (0.0, 0.4)))

@@ -285,11 +285,18 @@ def evidence_of_embedding(
     return evidence.constrain(raw, log_beta=False)
 
 
-def covariance_half(model: Model, result: Registration) -> Float[Array, "6 6"]:
-    """H with H H^T the covariance of a pair's pose, right perturbation; for a model that is calibrated."""
-    units = evidence_units(model.cfg)
+class Spread(NamedTuple):
+    """Calibrated covariance of a pair's pose, right perturbation."""
+
+    half: Float[Array, "6 6"]  # H with H H^T the covariance [rad, m]
+    doubt: Float[Array, ""]  # share of it that is doubt of the model, in [0, 1)
+
+
+def covariance(model: Model, result: Registration) -> Spread:
+    """Of a solved pair, for a model that is calibrated."""
+    units, weights = evidence_units(model.cfg), model.variables["covariance"]
     said = spread.inputs(result.statistics, result.nig, result.confidence, units)
-    return spread.half(model.variables["covariance"], said, result.T_target_source, units)
+    return Spread(spread.half(weights, said, result.T_target_source, units), spread.doubt(weights, said))
 
 
 def evidence_units(cfg: DeloConfig) -> Float[Array, "6"]:

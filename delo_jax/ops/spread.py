@@ -1,7 +1,8 @@
 """A full covariance of a pose error from what a solver says of its own answer: a small network on numbers, as pure functions.
 
 The covariance is predicted in the frame of the motion, x along it and z up, as a Cholesky factor (Williams 1996): whichever way the
-sensor is turned, the answer turns with it.
+sensor is turned, the answer turns with it. Beside it stands how unlike the pairs of the fit a pair is (Mahalanobis distance, as Lee et al.
+2018 have it for features): the farther away, the more of the covariance is doubt of the model.
 """
 
 import jax
@@ -23,10 +24,11 @@ Weights = dict[str, jax.Array]
 
 
 def init(num_inputs: int, width: int, key: Key[Array, ""]) -> Weights:
-    """Weights that predict one unit on every axis, whatever goes in; mean and deviation of the inputs are to be filled in."""
+    """Weights that predict one unit on every axis, whatever goes in; mean, deviation and whitener of the inputs are to be filled in."""
     return {
         "mean": jnp.zeros(num_inputs),
         "deviation": jnp.ones(num_inputs),
+        "whitener": jnp.eye(num_inputs),
         "hidden": jax.random.normal(key, (num_inputs, width)) / num_inputs**0.5,
         "hidden_bias": jnp.zeros(width),
         "out": jnp.zeros((width, NUM_OUTPUTS)),
@@ -50,6 +52,20 @@ def factor(weights: Weights, said: Float[Array, " i"]) -> Float[Array, "6 6"]:
     lower = jnp.zeros((6, 6), raw.dtype).at[_ROWS, _COLUMNS].set(raw)
     diagonal = jnp.exp(jnp.diagonal(lower))[:, None]
     return diagonal * jnp.where(jnp.eye(6, dtype=bool), 1.0, lower)
+
+
+def whitener(said: Float[Array, "n i"]) -> Float[Array, "i i"]:
+    """W that makes inputs uncorrelated and of variance one, but for directions in which they hardly vary."""
+    variances = jnp.var(said, axis=0) + 1e-6
+    covariance = jnp.cov(said, rowvar=False) + 1e-3 * jnp.diag(variances)
+    return jnp.linalg.inv(jnp.linalg.cholesky(covariance))
+
+
+@full_float32
+def doubt(weights: Weights, said: Float[Array, " i"]) -> Float[Array, ""]:
+    """Share of the covariance that is doubt of the model, in [0, 1): s / (1 + s), with s the mean squared whitened input, 1 in the fit."""
+    squared = jnp.mean((weights["whitener"] @ (said - weights["mean"])) ** 2)
+    return squared / (1.0 + squared)
 
 
 def motion_frame(T_target_source: Float[Array, "4 4"]) -> Float[Array, "6 6"]:

@@ -97,6 +97,75 @@ def ratios_figure(
     _save(figure, path)
 
 
+def cutoff_figure(
+    path: str | os.PathLike[str],
+    cutoffs: Float[np.ndarray, " c"],
+    curves: Mapping[str, Float[np.ndarray, "c k"]],
+    names: Sequence[str],
+    units: Sequence[str],
+    *,
+    thresholds: tuple[float, float],
+    title: str = "",
+) -> None:
+    """Draws the error of the pairs above each cut-off of the confidence, a panel for each axis, with a band between the curves.
+
+    Args:
+        path: the PNG file to write.
+        cutoffs: of the confidence, in [0, 1].
+        curves: condition -> root mean square errors, in units.
+        names: of the axes.
+        units: of the axes.
+        thresholds: ends of the band in which a gate skips.
+        title: written above the picture.
+    """
+    figure = Figure(figsize=(10.8, 6.4), layout="constrained")
+    axes = figure.subplots(2, -(-len(names) // 2), squeeze=False).ravel()
+    for axis, (ax, name, unit) in enumerate(zip(axes, names, units, strict=False)):
+        rows = np.stack([curve[:, axis] for curve in curves.values()])
+        ax.fill_between(100 * cutoffs, rows.min(axis=0), rows.max(axis=0), color=COLORS[0], alpha=0.15, lw=0)
+        for color, (label, row) in zip(COLORS, zip(curves, rows, strict=True), strict=False):
+            ax.plot(100 * cutoffs, row, color=color, lw=1.4, label=label)
+        for theta in thresholds:
+            ax.axvline(100 * theta, color="#8a8a8a", lw=1.0, ls="--")
+        ax.set(title=name, xlabel="confidence at least [%]", ylabel=f"RMSE [{unit}]", xlim=(0, 100), ylim=(0, None))
+        ax.grid(alpha=0.3)
+    for ax in axes[len(names) :]:
+        ax.set_axis_off()
+    axes[0].legend(loc="lower left", fontsize="x-small")
+    figure.suptitle(title)
+    _save(figure, path)
+
+
+def gap_figure(
+    path: str | os.PathLike[str],
+    doubts: Mapping[int, Float[np.ndarray, "_ k"]],
+    names: Sequence[str],
+    units: Sequence[str],
+    *,
+    title: str = "",
+) -> None:
+    """Draws quartiles of epistemic standard deviations by frame gap, a panel for each axis, on a logarithmic scale.
+
+    Args:
+        path: the PNG file to write.
+        doubts: gap in frames -> standard deviations > 0 of its pairs, in units.
+        names: of the axes.
+        units: of the axes.
+        title: written above the picture.
+    """
+    figure = Figure(figsize=(2.1 * len(names), 3.6), layout="constrained")
+    axes = figure.subplots(1, len(names), squeeze=False).ravel()
+    for axis, (ax, name, unit) in enumerate(zip(axes, names, units, strict=True)):
+        boxes = ax.boxplot([sigmas[:, axis] for sigmas in doubts.values()], whis=(5, 95), showfliers=False, patch_artist=True, widths=0.6)
+        for box, color in zip(boxes["boxes"], COLORS, strict=False):
+            box.set(facecolor=color, alpha=0.5)
+        ax.set(title=name, ylabel=f"σ [{unit}]", yscale="log", xlabel="gap [frames]")
+        ax.set_xticks(range(1, len(doubts) + 1), [str(gap) for gap in doubts])
+        ax.grid(alpha=0.3, axis="y")
+    figure.suptitle(title)
+    _save(figure, path)
+
+
 def _draw_errors(ax: Axes, error: np.ndarray, sigma: np.ndarray) -> None:
     low, high = np.quantile(sigma, [0.005, 0.995]) * [0.7, 1.4]
     widen = max(1.0, np.sqrt(12.0 * low / high))  # more than a decade, or the ticks' labels would be many

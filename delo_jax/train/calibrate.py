@@ -81,6 +81,12 @@ def halves(model: delo.Model, weights: spread.Weights, pairs: Pairs) -> np.ndarr
     return np.asarray(jax.jit(one)(weights, said, pairs.Ts_target_source.astype(np.float32), units), np.float64)
 
 
+def doubts(model: delo.Model, weights: spread.Weights, pairs: Pairs) -> np.ndarray:
+    """(n,) float64 share of each covariance that is doubt of the model."""
+    said = _said(pairs, delo.evidence_units(model.cfg))
+    return np.asarray(jax.jit(jax.vmap(spread.doubt, in_axes=(None, 0)))(weights, said), np.float64)
+
+
 def fit(
     model: delo.Model,
     pairs: Pairs,
@@ -102,7 +108,7 @@ def fit(
     units = delo.evidence_units(model.cfg)
     said = _said(pairs, units)
     start = spread.init(said.shape[1], WIDTH, jax.random.key(seed)) | (more or {})
-    fixed = {"mean": jnp.mean(said, axis=0), "deviation": jnp.std(said, axis=0) + 1e-3}
+    fixed = {"mean": jnp.mean(said, axis=0), "deviation": jnp.std(said, axis=0) + 1e-3, "whitener": spread.whitener(said)}
     by_pair = jax.vmap(likelihood, in_axes=(None, 0, 0, 0, None))
 
     def loss(free, rows):
@@ -142,9 +148,9 @@ def calibrate(model: delo.Model, pairs: Pairs, on_fit: Callable[[], None] = lamb
     weights["out_bias"] = weights["out_bias"].at[spread.DIAGONAL].add(np.log(scale))
     scaled = turns @ np.diag(scale) @ backs
     unseen = scaled @ unseen @ scaled.transpose(0, 2, 1)
-    doubts = np.diagonal(unseen, axis1=1, axis2=2) / (1.0 + pairs.nig.nu)
+    epistemic = doubts(model, weights, pairs)[:, None] * np.diagonal(unseen, axis1=1, axis2=2)
     evidence: Any = replace(model.cfg.evidence, covariance_width=WIDTH)
-    variables = model.variables | {"covariance": weights, gate.NAME: gate.Quantiles.fit(doubts[good]).stored()}
+    variables = model.variables | {"covariance": weights, gate.NAME: gate.Quantiles.fit(epistemic[good]).stored()}
     return delo.Model(variables, replace(model.cfg, evidence=evidence)), unseen
 
 

@@ -34,15 +34,14 @@ def from_evidence(gamma: np.ndarray, nu: np.ndarray, alpha: np.ndarray, beta: np
     return Uncertainty(aleatoric, epistemic, np.diag(aleatoric + epistemic) + np.outer(gamma, gamma))
 
 
-def from_half(half: np.ndarray, nu: np.ndarray) -> Uncertainty:
-    """A calibrated covariance; the evidence says which part of each variance is doubt of the model, 1 / (1 + nu).
+def from_half(half: np.ndarray, doubt: float) -> Uncertainty:
+    """A calibrated covariance.
 
     Args:
         half: (6, 6) H with H H^T the covariance [rad, m].
-        nu: (6,) virtual observations of the mean.
+        doubt: share of it that is doubt of the model.
     """
     covariance = half @ half.T
-    doubt = 1.0 / (1.0 + nu)
     total = np.diag(covariance)
     return Uncertainty((1.0 - doubt) * total, doubt * total, covariance)
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.spatial.distance import mahalanobis
 from scipy.stats import multivariate_normal, multivariate_t
 
 from delo_jax.ops import spread
@@ -84,3 +85,26 @@ def test_head_under_jit_and_vmap():
     rows = [problem(seed)[1:3] for seed in range(3)]
     batches = [jnp.stack(arrays) for arrays in zip(*rows, strict=True)]
     assert_transforms_agree(lambda said, T: spread.half(weights, said, T, UNITS) / UNITS[:, None], *batches, rtol=1e-4, atol=1e-4)
+
+
+def test_doubt_is_the_distance_from_the_pairs_of_the_fit():
+    """Oracle: scipy's Mahalanobis distance with the sample covariance; over the sample its mean square is one a number."""
+    rng = np.random.default_rng(0)
+    said = rng.normal(size=(4000, 5)) @ rng.normal(size=(5, 5)) + 3.0
+    weights = spread.init(5, 3, jax.random.key(0)) | {
+        "mean": jnp.asarray(said.mean(axis=0)),
+        "whitener": spread.whitener(jnp.asarray(said)),
+    }
+    found = np.asarray(jax.vmap(spread.doubt, in_axes=(None, 0))(weights, jnp.asarray(said)), np.float64)
+    squared = found / (1.0 - found)
+    precision = np.linalg.inv(np.cov(said.T))
+    expected = [mahalanobis(row, said.mean(axis=0), precision) ** 2 / 5 for row in said[:50]]
+    np.testing.assert_allclose(squared[:50], expected, rtol=0.05)
+    assert np.mean(squared) == pytest.approx(1.0, abs=0.05)
+    assert float(spread.doubt(weights, jnp.asarray(said.mean(axis=0) + 100.0 * said.std(axis=0)))) > 0.99
+
+
+def test_whitener_of_numbers_that_never_vary_is_finite():
+    """Oracle: finite, and such a number far away is doubted."""
+    W = spread.whitener(jnp.zeros((50, 3)))
+    assert np.isfinite(W).all()

@@ -4,7 +4,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from delo_jax.report.calibration import error_figure, ratios_figure, reliability_figure
+from delo_jax.report.calibration import cutoff_figure, error_figure, gap_figure, ratios_figure, reliability_figure
 
 AXES = ("roll", "pitch", "yaw", "forward", "lateral", "vertical")
 
@@ -39,3 +39,19 @@ def test_ratios_of_conditions(tmp_path):
     """Oracle: is_a_picture."""
     ratios_figure(tmp_path / "r.png", {"rain": np.linspace(1.0, 5.0, 6), "gap 10": np.full(6, 30.0)}, AXES, bound=1.5)
     assert is_a_picture(tmp_path / "r.png")
+
+
+def test_errors_by_confidence(tmp_path):
+    """Oracle: is_a_picture."""
+    cutoffs = np.linspace(0.0, 0.95, 20)
+    curves = {f"gap {gap}": gap * (2.0 - cutoffs[:, None]) * np.arange(1.0, 7.0) for gap in (1, 2)}
+    cutoff_figure(tmp_path / "c.png", cutoffs, curves, AXES, ["mrad"] * 6, thresholds=(0.2, 0.7), title="pairs")
+    assert is_a_picture(tmp_path / "c.png")
+
+
+def test_doubt_by_gap(tmp_path):
+    """Oracle: is_a_picture; other numbers of pairs at each gap."""
+    rng = np.random.default_rng(0)
+    doubts = {gap: gap * np.exp(0.3 * rng.normal(size=(count, 6))) for gap, count in ((1, 30), (2, 20), (200, 5))}
+    gap_figure(tmp_path / "g.png", doubts, AXES, ["mrad"] * 6, title="drives")
+    assert is_a_picture(tmp_path / "g.png")

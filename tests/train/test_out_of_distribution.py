@@ -28,7 +28,7 @@ def test_doubt_grows_with_the_beams_of_another_sensor():
             encodings = [inference.encode(model, preprocess(scan.points, model.cfg.preprocess)) for scan in clip]
             for target in (1, 2):
                 result = inference.solve(model, encodings[0], encodings[target], jnp.eye(4))
-                half, nu = jax.device_get((inference.covariance_half(model, result), result.nig.nu))
-                found.append(covariance.from_half(np.asarray(half, np.float64), np.asarray(nu, np.float64)).epistemic)
+                half, doubt = jax.device_get(inference.pair_covariance(model, result))
+                found.append(covariance.from_half(np.asarray(half, np.float64), float(doubt)).epistemic)
     usual, other = (np.median(found, axis=0) for found in variances.values())
     assert np.mean(other / usual) > 1.5
