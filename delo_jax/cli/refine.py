@@ -9,7 +9,6 @@ import numpy as np
 import tyro
 
 from delo_jax.cli.command import Command
-from delo_jax.cli.eval import true_poses
 from delo_jax.cli.stored import StoredFrames, facts_of, frames_of, options_of
 from delo_jax.config import RefineConfig
 from delo_jax.errors import DatasetError
@@ -42,16 +41,18 @@ class Refine(Command):
 
     def run(self) -> int:
         """Registers pairs, solves, writes refined.tum, refined_kitti.txt and refined_covariances.npy, and prints what was gained."""
-        from delo_jax import weights
         from delo_jax.cli.console import print_summary
         from delo_jax.cli.refinement import FILES, refine, write
         from delo_jax.cli.summary import refinement_rows
+        from delo_jax.refine.jax_backend import check_length
 
         facts, options = facts_of(self.folder), options_of(self.folder)
         frames = frames_of(self.folder, facts)
         if len(frames.Ts_world_lidar) < 2:
             raise DatasetError(f"{self.folder}: expected a run of two or more frames, got {len(frames.Ts_world_lidar)}; nothing to refine")
-        scans = Scans(weights.load(facts["weights"]["name"]), self._open(facts, options), frames, deskew=options.get("deskew") != "off")
+        if self.backend == "jax":
+            check_length(len(frames.Ts_world_lidar))
+        scans = Scans(_weights_of(self.folder, facts), self._open(facts, options), frames, deskew=options.get("deskew") != "off")
         if len(scans.dataset) < len(frames.stamps_ns):
             what = f"expected the {len(frames.stamps_ns)} scans of the run, got {len(scans.dataset)}"
             raise DatasetError(f"{scans.dataset.name}: {what}; give their folder by --data")
@@ -60,10 +61,9 @@ class Refine(Command):
         found = refine(record, Ts_online, loops=loops, backend=self.backend)
         T_cam_lidar = facts.get("T_cam_lidar")
         write(self.folder, found, frames.stamps_ns, None if T_cam_lidar is None else np.array(T_cam_lidar))
-        try:
-            truth = true_poses(self.folder, facts, frames.stamps_ns)[0]
-        except DatasetError:
-            truth = None
+        truth = scans.dataset.truth
+        if truth is not None:
+            truth = truth[: len(frames.stamps_ns)]
         print_summary(refinement_rows(found, frames.Ts_world_lidar, truth), "pose graph")
         print(f"{', '.join(FILES)}: {self.folder}")
         return 0
@@ -83,6 +83,18 @@ class Refine(Command):
         )
 
 
+def _weights_of(folder: Path, facts: dict[str, Any]) -> "Model":
+    """Those that the run was made with."""
+    from delo_jax import weights
+
+    stored = facts.get("weights") or {}
+    if not {"name", "sha256"} <= set(stored):
+        raise DatasetError(f"{folder / 'run.json'}: expected name and SHA-256 of the weights, got {stored}; run again")
+    if weights.read_card(stored["name"])["sha256"] != stored["sha256"]:
+        raise DatasetError(f"{folder}: expected the weights that it was made with, got others of the name {stored['name']}; run again")
+    return weights.load(stored["name"])
+
+
 class Scans:
     """The scans of a run, prepared and de-skewed as far as its poses say how."""
 
@@ -92,7 +104,7 @@ class Scans:
         """The same, the last ones kept."""
 
     def prepared(self, number: int) -> "PreparedScan | None":
-        """A scan as it was registered; None where it was rejected."""
+        """A scan de-skewed with the mean velocity that the poses say, not that within the sweep; None where it was rejected."""
         from delo_jax import inference
 
         if self.frames.rejected[number]:
@@ -146,6 +158,5 @@ def _loops(scans: Scans, record: "Record") -> "Factors":
                 back.append(inference.align(scans.params, b, a, np.eye(4)))
             bar.advance(task)
     kept = loops.verify(chain, pairs, there, back, record.local)
-    record.counts["loop proposed"] += len(pairs)
-    record.counts["loop kept"] += len(kept.sources)
+    print(f"loops: {len(pairs)} proposed, {len(kept.sources)} kept")
     return kept

@@ -72,7 +72,7 @@ def frames_of(folder: Path, facts: dict[str, Any]) -> StoredFrames:
         covariances, local = (np.load(folder / f"{name}_covariances.npy") for name in ("pose", "local"))
         since = np.array([int(row["since_index"]) for row in table], np.int64)
         rejected = np.array([row["status"] == "rejected" for row in table])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
         raise DatasetError(f"{folder}: expected the files of a run, got {error}; run again") from error
     count = min(len(Ts), len(table), len(covariances), len(local))
     return StoredFrames(*(array[:count] for array in (stamps_ns, Ts, since, rejected, covariances, local)))

@@ -33,11 +33,17 @@ def refinement_rows(found: Refinement, Ts_before: np.ndarray, Ts_true: np.ndarra
     factors = ", ".join(f"{kind} {count}" for kind, count in found.num_factors.items())
     result = [Row("factors of the graph", factors)]
     if found.counts:
-        result.append(Row("pairs of key frames", ", ".join(f"{what} {count}" for what, count in found.counts.most_common())))
+        result.append(
+            Row(
+                "passes of key frames, and those without a pose", ", ".join(f"{what} {count}" for what, count in found.counts.most_common())
+            )
+        )
     for what, seconds in (("network passes", found.pass_s), ("smoother", found.smooth_s)):
         p50, p95 = 1e3 * np.percentile(seconds, [50, 95])
         result.append(Row(f"{what} a frame, second thread, p50 / p95", f"{p50:.1f} / {p95:.1f}", "ms"))
     result.append(Row("whole graph", f"{found.solve_s:.2f}", "s"))
+    if not found.refined.converged:
+        result.append(Row("whole graph", "has not converged"))
     if Ts_true is not None and len(Ts_true) > 2:
         result += _errors_of(found, Ts_before, Ts_true)
     return result

@@ -5,10 +5,10 @@ import itertools
 import json
 import os
 import platform
+import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -23,13 +23,14 @@ from delo_jax.cli.console import interruptible, progress, working
 from delo_jax.cli.refinement import Refinement, refine, write
 from delo_jax.config import DeloConfig, to_toml
 from delo_jax.data.fields import RawScan
-from delo_jax.errors import ConfigError, ScanError
+from delo_jax.errors import ConfigError, DeloError, ScanError
 from delo_jax.model.delo import Model
 from delo_jax.pipeline.lidar_odometry import Frame, LidarOdometry
 from delo_jax.pipeline.scan_to_map import compile_steps
 from delo_jax.pipeline.trajectory import RunWriter, Trajectory
 from delo_jax.refine.refiner import Refiner, Tracked
 from delo_jax.report.figures import trajectory_figure
+from delo_jax.uncertainty import stream
 
 STAGES = ("prepare", "solve", "insert")
 
@@ -136,7 +137,7 @@ def track(job: Job) -> Result:
     with working("compiling"):
         compile_s = compile_model(params, use_map=job.use_map)
     print(f"compiled in {compile_s:.1f} s")
-    facts = _facts(job, card, compile_s)
+    facts = _facts(job, params, card, compile_s)
     try:
         job.folder.mkdir(parents=True, exist_ok=True)
         (job.folder / "config.toml").write_text(to_toml(_Effective(job.command, params.cfg)))
@@ -145,16 +146,28 @@ def track(job: Job) -> Result:
     except OSError as error:
         raise ConfigError(f"--out {job.folder}: expected a folder to write to, got {error.strerror}; choose another") from error
     refiner = Refiner(params) if job.refine else None
-    with writer, refiner or nullcontext():
-        acquired, interrupted = _loop(job, odometry, writer, refiner)
-    trajectory = odometry.trajectory()
-    result = _result(job, trajectory, acquired, compile_s, interrupted)
-    if refiner is not None and len(trajectory) > 1:
-        found = refine(refiner.record, refiner.Ts_world_lidar)
-        write(job.folder, found, trajectory.stamps_ns, job.source.T_cam_lidar)
-        result = result._replace(refinement=found)
-    _finish(job, result, facts)
-    return result
+    try:
+        with writer:
+            acquired, interrupted = _loop(job, odometry, writer, refiner)
+        result = _result(job, odometry.trajectory(), acquired, compile_s, interrupted)
+        _finish(job, result, facts)
+        return result._replace(refinement=_refined(job, refiner, result.trajectory))
+    finally:
+        if refiner is not None:
+            refiner.stop()
+
+
+def _refined(job: Job, refiner: Refiner | None, trajectory: Trajectory) -> Refinement | None:
+    """The pose graph of the run, written to its folder; where it fails, a sentence: the odometry stands without it."""
+    if refiner is None or len(trajectory) < 2:
+        return None
+    try:
+        found = refine(refiner.close(), refiner.Ts_world_lidar)
+    except DeloError as error:
+        print(f"delo: not refined: {error}", file=sys.stderr)
+        return None
+    write(job.folder, found, trajectory.stamps_ns, job.source.T_cam_lidar)
+    return found
 
 
 def _loop(job: Job, odometry: LidarOdometry, writer: RunWriter, refiner: Refiner | None) -> tuple[list[float], bool]:
@@ -227,7 +240,7 @@ def _finish(job: Job, result: Result, facts: dict[str, Any]) -> None:
         )
 
 
-def _facts(job: Job, card: dict[str, Any], compile_s: float) -> dict[str, Any]:
+def _facts(job: Job, params: Model, card: dict[str, Any], compile_s: float) -> dict[str, Any]:
     T_cam_lidar = job.source.T_cam_lidar
     return {
         "versions": {
@@ -241,9 +254,16 @@ def _facts(job: Job, card: dict[str, Any], compile_s: float) -> dict[str, Any]:
         "num_scans": len(job.source),
         "poses_kitti_frame": "lidar" if T_cam_lidar is None else "camera",
         "T_cam_lidar": None if T_cam_lidar is None else T_cam_lidar.tolist(),
-        "uncertainty": f"{'information matrix' if job.use_map else 'evidence head'}, not calibrated",
+        "uncertainty": _uncertainty(job, params),
         "compile_s": round(compile_s, 3),
     }
+
+
+def _uncertainty(job: Job, params: Model) -> str:
+    """Where the covariances are from."""
+    calibrated = stream.NAME in params.variables if job.use_map else params.cfg.evidence.covariance_width > 0
+    source = "fitted on simulated " + ("drives" if job.use_map else "pairs")
+    return source if calibrated else f"{'information matrix' if job.use_map else 'evidence head'}, not calibrated"
 
 
 def write_json(path: Path, table: dict[str, Any]) -> None:

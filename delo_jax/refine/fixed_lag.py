@@ -1,5 +1,7 @@
 """Smooths a stream with GTSAM's incremental fixed-lag smoother: the newest poses are estimated anew with every factor, older ones stand."""
 
+from typing import Any
+
 import gtsam
 import numpy as np
 
@@ -56,20 +58,22 @@ class FixedLagSmoother:
 
     def iterate(self) -> None:
         """One more step towards the best fit of what is known."""
-        self._smoother.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {})
+        self._step(gtsam.NonlinearFactorGraph(), gtsam.Values(), {})
         self._take()
-
-    def covariance(self, number: int) -> np.ndarray:
-        """(6, 6) marginal of a pose within the lag."""
-        return self._smoother.marginalCovariance(number)
 
     def _update(self, graph: gtsam.NonlinearFactorGraph, number: int, T_world_lidar: np.ndarray) -> None:
         values = gtsam.Values()
         values.insert(number, gtsam.Pose3(T_world_lidar))
-        self._smoother.update(graph, values, {number: float(number)})
+        self._step(graph, values, {number: float(number)})
         if number == len(self.Ts_world_lidar):
             self.Ts_world_lidar.append(T_world_lidar)
         self._take()
+
+    def _step(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times: Any) -> None:
+        try:
+            self._smoother.update(graph, values, times)
+        except RuntimeError as error:  # an indeterminate system; the smoother is of no use any more
+            raise DeloError(f"smoother: expected a graph that determines all poses, got {str(error).strip().splitlines()[0]}") from error
 
     def _take(self) -> None:
         found = self._smoother.calculateEstimate()

@@ -63,4 +63,5 @@ def solve(plan: Plan) -> Refined:
         raise DeloError(f"graph: expected one that determines all poses, got {str(error).strip().splitlines()[0]}") from error
     Ts_refined = np.stack([Ts[0], *(found.atPose3(number).matrix() for number in range(1, len(Ts)))])
     covariances[0] = 0.0
-    return Refined(Ts_refined, covariances, graph.error(start), graph.error(found), optimizer.iterations())
+    num_iterations = optimizer.iterations()
+    return Refined(Ts_refined, covariances, graph.error(start), graph.error(found), num_iterations, num_iterations < MAX_ITERATIONS)

@@ -4,7 +4,6 @@ The unknowns are the motions from frame to frame, each in units of its own uncer
 odometry's own residuals are the unknowns themselves and conjugate gradients need few steps, however long the drive.
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -83,13 +82,12 @@ def refined_poses(problem: Problem) -> tuple[Float[Array, "n 4 4"], Int[Array, "
     return poses(problem, found.value), found.stats["num_steps"]
 
 
-@functools.partial(jax.jit, static_argnames="with_marginals")
-def _solve(problem: Problem, *, with_marginals: bool) -> tuple[Array, Array, Array, Array]:
+@jax.jit
+def _solve(problem: Problem) -> tuple[Array, ...]:
     Ts, num_steps = refined_poses(problem)
     start = poses(problem, jnp.zeros((len(problem.Ts_step), 6)))
     errors = [0.5 * jnp.sum(damped(problem, whitened(problem, T)) ** 2) for T in (start, Ts)]
-    Cs = _marginals(problem, Ts) if with_marginals else jnp.zeros((len(Ts), 6, 6))
-    return Ts, Cs, jnp.stack(errors), num_steps
+    return Ts, _marginals(problem, Ts), jnp.stack(errors), num_steps
 
 
 def _marginals(problem: Problem, Ts: Float[Array, "n 4 4"]) -> Float[Array, "n 6 6"]:
@@ -114,20 +112,25 @@ def _marginals(problem: Problem, Ts: Float[Array, "n 4 4"]) -> Float[Array, "n 6
     return jnp.concatenate([jnp.zeros((1, 6, 6)), own])
 
 
-def solve(plan: Plan, *, with_marginals: bool = True) -> Refined:
+def solve(plan: Plan) -> Refined:
     """The poses that fit the factors best, with their marginal covariances; compiled once per number of poses and factors.
 
     Args:
-        plan: what holds which.
-        with_marginals: of up to 1,000 poses; zeros without.
+        plan: what holds which; up to 1,000 poses.
 
     Raises:
-        DeloError: a plan that cannot be solved, see `plan.check`, or marginals of too long a drive.
+        DeloError: a plan that cannot be solved, see `plan.check`, too long a drive, or no solution.
     """
     check(plan)
-    if with_marginals and len(plan.Ts_world_lidar) > MAX_DENSE_POSES:
-        what = f"expected at most {MAX_DENSE_POSES} for marginals, got {len(plan.Ts_world_lidar)}"
-        raise DeloError(f"poses: {what}; take the gtsam backend, or leave the marginals out")
+    check_length(len(plan.Ts_world_lidar))
     with jax.enable_x64(True):
-        Ts, Cs, errors, num_steps = jax.device_get(_solve(problem_of(plan), with_marginals=with_marginals))
-    return Refined(Ts, Cs, float(errors[0]), float(errors[1]), int(num_steps))
+        Ts, Cs, errors, num_steps = jax.device_get(_solve(problem_of(plan)))
+    if not (np.isfinite(Ts).all() and np.isfinite(Cs).all()):
+        raise DeloError("graph: expected one that determines all poses, got none that are finite; take the gtsam backend")
+    return Refined(Ts, Cs, float(errors[0]), float(errors[1]), int(num_steps), bool(num_steps < MAX_STEPS))
+
+
+def check_length(num_poses: int) -> None:
+    """Raise a DeloError where the marginals of so many poses are too much for a dense matrix."""
+    if num_poses > MAX_DENSE_POSES:
+        raise DeloError(f"poses: expected at most {MAX_DENSE_POSES} for marginals, got {num_poses}; take the gtsam backend")

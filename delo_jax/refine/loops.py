@@ -18,7 +18,7 @@ CONSISTENT = float(chi2(6).ppf(0.999))  # of a squared Mahalanobis distance
 
 
 class Chain(NamedTuple):
-    """Poses and what is known of the motions between any two of them."""
+    """Poses, and what is known of the motion between two of them that lie on one path: rejected frames lie on none."""
 
     Ts_world_lidar: np.ndarray  # (n, 4, 4)
     covariances: np.ndarray  # (n, 6, 6) left perturbation, in the world, grown since frame 0

@@ -12,7 +12,6 @@ from delo_jax.geometry import se3
 
 KINDS = ("odometry", "multi-frame", "loop")
 ODOMETRY, MULTI_FRAME, LOOP = range(len(KINDS))
-ODOMETRY_GAP, KEY_GAP = 2, 4  # the paper's o and p, frames
 CAUCHY_SCALE = 6.0  # of the length of a whitened residual; factors of honest noise keep 86 % of their weight
 GAUGE_SIGMA = 1e-8  # of the first pose, which defines the world [rad, m]
 STILL = np.repeat([1e-5, 1e-4], 3)  # a pose is handed on no better than this [rad, m]
@@ -54,6 +53,7 @@ class Refined(NamedTuple):
     error_before: float  # half the sum of squared whitened residuals, robust ones damped
     error_after: float
     num_iterations: int
+    converged: bool
 
 
 def factors(
@@ -86,7 +86,13 @@ def odometry_factors(Ts_world_lidar: np.ndarray, since: np.ndarray, covariances:
         since: (n,) number of the frame that each motion starts from; a frame's own number where there is none.
         covariances: (n, 6, 6) of the poses.
         local: (n, 6, 6) the part of them that is not handed on.
+
+    Raises:
+        DeloError: covariances that are not finite.
     """
+    bad = np.flatnonzero(~(np.isfinite(covariances) & np.isfinite(local)).all(axis=(1, 2)))
+    if len(bad):
+        raise DeloError(f"pose {bad[0]}: expected a finite covariance, got numbers that are not; give it a wide one")
     targets = np.arange(1, len(Ts_world_lidar))
     sources = np.where(since[1:] >= targets, targets - 1, since[1:])  # before the first usable frame there is no motion
     steps = se3.inverse(Ts_world_lidar[sources]) @ Ts_world_lidar[targets]
@@ -118,13 +124,6 @@ def between_frames(pairs: np.ndarray, Ts_source_target: np.ndarray, covariances:
         return factors([], [], np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), kind)
     total = covariances + carried(local[sources], Ts_source_target) + local[targets]
     return factors(sources, targets, Ts_source_target, total, kind)
-
-
-def multi_frame_pairs(num_frames: int, *, odometry_gap: int = ODOMETRY_GAP, key_gap: int = KEY_GAP) -> np.ndarray:
-    """(k, 2) frames to register beside the odometry: (f, f + o) of all, (f, f + p) of every p-th (paper, 3.3); a gap of 0: none."""
-    every = np.arange(max(num_frames - odometry_gap, 0) if odometry_gap else 0)
-    keys = np.arange(0, max(num_frames - key_gap, 0), max(key_gap, 1)) if key_gap else every[:0]
-    return np.concatenate([np.stack([every, every + odometry_gap], 1), np.stack([keys, keys + key_gap], 1)])
 
 
 def check(plan: Plan) -> Plan:

@@ -12,6 +12,7 @@ import numpy as np
 
 from delo_jax import inference
 from delo_jax.config import RefineConfig
+from delo_jax.errors import DeloError
 from delo_jax.geometry import se3
 from delo_jax.inference import Estimate, PreparedScan
 from delo_jax.model.delo import Model
@@ -19,7 +20,7 @@ from delo_jax.refine.fixed_lag import FixedLagSmoother
 from delo_jax.refine.plan import MULTI_FRAME, Factors, Plan, between_frames, joined, odometry_factors
 from delo_jax.uncertainty import gate
 
-MAX_WAITING = 100  # frames; whoever streams faster than that waits
+MAX_WAITING = 20  # frames; whoever streams faster than the passes waits then
 
 
 class Tracked(NamedTuple):
@@ -60,13 +61,12 @@ class Record:
 
 
 class Refiner:
-    """Takes the frames of an odometry, one by one, and smooths them. A context manager; an error in the thread is raised when it closes.
+    """Takes the frames of an odometry, one by one, and smooths them. A context manager: left by an error, it drops what is waiting.
 
     Args:
         params: weights.
         cfg: which pairs count.
         align: two scans and a start to an estimate; `inference.align` by default.
-
     """
 
     def __init__(
@@ -80,23 +80,36 @@ class Refiner:
         self._quantiles = gate.Quantiles.of(params.variables)
         self._scans: deque[PreparedScan | None] = deque(maxlen=max(self._cfg.odometry_gap, self._cfg.key_gap) + 1)
         self._smoother: FixedLagSmoother | None = None
-        self._error: BaseException | None = None
+        self._error: Exception | None = None
+        self._stopped = False
         self.record = Record()
         self._waiting: queue.Queue[Tracked | None] = queue.Queue(MAX_WAITING)
         self._thread = threading.Thread(target=self._run, name="refiner", daemon=True)
         self._thread.start()
 
     def add(self, frame: Tracked) -> None:
-        """The next frame; returns at once, unless a hundred frames are waiting."""
-        self._raise()
+        """The next frame; returns at once, unless twenty frames are waiting. After an error in the thread frames are dropped."""
         self._waiting.put(frame)
 
     def close(self) -> Record:
-        """Waits for the frames that are still there."""
+        """Waits for the frames that are still there.
+
+        Raises:
+            DeloError: what went wrong in the thread.
+        """
         self._waiting.put(None)
         self._thread.join()
-        self._raise()
+        if self._error is not None:
+            kind = "" if isinstance(self._error, DeloError) else f"{type(self._error).__name__}: "
+            raise DeloError(f"refinement: {kind}{self._error}") from self._error
         return self.record
+
+    def stop(self) -> None:
+        """Ends the thread after the frame that it is at; nothing happens where it has ended."""
+        self._stopped = True
+        if self._thread.is_alive():
+            self._waiting.put(None)
+            self._thread.join()
 
     @property
     def Ts_world_lidar(self) -> np.ndarray:
@@ -111,17 +124,12 @@ class Refiner:
         """Ends the thread; does not hide another error."""
         if kind is None:
             self.close()
-        elif self._thread.is_alive():
-            self._waiting.put(None)
-            self._thread.join()
-
-    def _raise(self) -> None:
-        if self._error is not None:
-            raise self._error
+        else:
+            self.stop()
 
     def _run(self) -> None:
         while (frame := self._waiting.get()) is not None:
-            if self._error is None:
+            if self._error is None and not self._stopped:
                 try:
                     self._take(frame)
                 except Exception as error:  # for the caller; the queue is still emptied, so that nobody waits for ever

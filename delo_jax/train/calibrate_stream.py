@@ -15,6 +15,7 @@ import optimistix
 from scipy.stats import norm
 
 from delo_jax.data.fields import FRAME_PERIOD_NS
+from delo_jax.errors import WeightsError
 from delo_jax.geometry import se3
 from delo_jax.model.delo import Model
 from delo_jax.pipeline.lidar_odometry import LidarOdometry
@@ -143,6 +144,8 @@ def segments(drives: Sequence[Drive]) -> Segments:
                 drives=np.array(number),
             )
             rows.append(row)
+    if not rows:
+        raise WeightsError("weights: expected some motions on the map with status ok, got none on any drive; train them first")
     return Segments(*(np.stack(arrays) for arrays in zip(*rows, strict=True)))
 
 
@@ -203,8 +206,9 @@ def calibrate(model: Model, rows: Segments, on_fit: Callable[[], None] = lambda:
         on_fit: called after each fit, of which there are `num_fits`.
     """
     fits: list[tuple[np.ndarray, StreamNoise]] = []
+    drives = np.unique(rows.drives, return_inverse=True)[1]  # some may have left no row
     for fold in range(num_fits(rows) - 1):
-        away = rows.drives % (num_fits(rows) - 1) == fold
+        away = drives % (num_fits(rows) - 1) == fold
         fits.append((away, fit(rows.rows(~away))))
         on_fit()
     scales = np.ones(2)

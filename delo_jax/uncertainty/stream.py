@@ -105,7 +105,7 @@ class Standing(NamedTuple):
     local: np.ndarray
     """Of the pose on the map, or since the last pose on it."""
     begins_map: bool
-    """The map begins here: whatever is wrong with this scan is in all that follows."""
+    """No scan has been registered to the map yet: what is wrong with the scan that it began with is in all that follows."""
 
     @property
     def covariance(self) -> np.ndarray:
@@ -119,7 +119,7 @@ class Standing(NamedTuple):
     def alone(self, covariance: np.ndarray, T: np.ndarray) -> "Standing":
         """After a motion T that no map has measured, with its covariance."""
         Ad = se3.adjoint(se3.inverse(T))
-        return Standing(Ad @ self.drift @ Ad.T, Ad @ self.local @ Ad.T + covariance, False)
+        return Standing(Ad @ self.drift @ Ad.T, Ad @ self.local @ Ad.T + covariance, self.begins_map)
 
     def on_map(self, noise: OnMap, T: np.ndarray) -> "tuple[Uncertainty, Standing]":
         """Uncertainty of a motion T to a pose that was registered to the map, and what is then known of that pose.
@@ -128,11 +128,11 @@ class Standing(NamedTuple):
         to be as wrong as the one after it.
         """
         Ad = se3.adjoint(se3.inverse(T))
-        before = noise.local if self.begins_map else Ad @ self.local @ Ad.T
-        drift = Ad @ self.drift @ Ad.T + noise.step
-        ends = before + noise.local
+        first = noise.local if self.begins_map else np.zeros((6, 6))
+        drift = Ad @ self.drift @ Ad.T + noise.step + first
+        ends = Ad @ self.local @ Ad.T + first + noise.local
         known = Uncertainty(np.diag(ends).copy(), np.diag(noise.step).copy(), ends + noise.step)
-        return known, Standing(drift + before if self.begins_map else drift, noise.local, False)
+        return known, Standing(drift, noise.local, False)
 
 
 EXACT = Standing(np.zeros((6, 6)), np.zeros((6, 6)), True)

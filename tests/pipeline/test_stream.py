@@ -31,7 +31,7 @@ def test_calibrated_covariances_on_the_map():
     the map, and all the drift. The registration's own is what the same drive says without numbers; poses are the same to the bit.
     """
     scans = [sweep(k) for k in range(6)]
-    plain, frames = drive(scans, with_stream(None)), drive(scans, with_stream(NUMBERS))
+    plain, frames = drive(scans, with_stream(None), stamp_sigma_s=0.0), drive(scans, with_stream(NUMBERS), stamp_sigma_s=0.0)
     drift = local = np.zeros((6, 6))
     for k, (frame, other) in enumerate(zip(frames, plain, strict=True)):
         assert frame.T_world_lidar.tobytes() == other.T_world_lidar.tobytes()
@@ -52,9 +52,21 @@ def test_calibrated_covariances_on_the_map():
     assert frames[5].covariance[0, 0] < 0.7 * composed(frames[4].covariance, frames[5])[0, 0]  # roll: hardly any drift
 
 
+def test_stamps_that_are_not_exact_are_in_the_covariance():
+    """Oracle: by hand: sigma^2 v v^T at both ends of a motion, v the body velocity, at one end of a pose; the drift knows none of it."""
+    scans, sigma = [sweep(k) for k in range(5)], 0.004
+    exact, frames = (drive(scans, with_stream(NUMBERS), stamp_sigma_s=one) for one in (0.0, sigma))
+    moved = [sigma**2 * np.outer(v, v) for v in (se3.log(frame.motion.T_target_source) / 0.1 for frame in frames[1:])]
+    Ad = adjoint(np.linalg.inv(frames[4].motion.T_target_source))
+    np.testing.assert_allclose(
+        frames[4].motion.covariance - exact[4].motion.covariance, Ad @ moved[2] @ Ad.T + moved[3], rtol=1e-5, atol=1e-12
+    )
+    np.testing.assert_allclose(frames[4].local - exact[4].local, moved[3], rtol=1e-5, atol=1e-12)
+
+
 def test_weights_without_numbers_of_a_drive_chain_as_before():
     """Oracle: the composition of the motions' covariances."""
-    frames, before = drive([sweep(k) for k in range(5)], with_stream(None)), np.zeros((6, 6))
+    frames, before = drive([sweep(k) for k in range(5)], with_stream(None), stamp_sigma_s=0.0), np.zeros((6, 6))
     for frame in frames:
         before = composed(before, frame)
         np.testing.assert_allclose(frame.covariance, before, rtol=1e-9, atol=1e-15)
@@ -64,7 +76,7 @@ def test_weights_without_numbers_of_a_drive_chain_as_before():
 def test_sweeps_that_change_their_velocity_are_known_less():
     """Oracle: by hand: the numbers of a swing alone, and a drive that turns less from scan to scan than the last time."""
     numbers = NUMBERS._replace(share=0.0, drift_share=0.0, drift_forward=0.0, heave_pitch=0.0)
-    odometry, frames = LidarOdometry(with_stream(numbers)), []
+    odometry, frames = LidarOdometry(with_stream(numbers), stamp_sigma_s=0.0), []
     for k in range(4):
         points = sweep(k)
         frames.append(odometry.register(points, times_s=np.zeros(len(points))))
@@ -82,7 +94,7 @@ def test_rejected_frames_are_wide_and_the_map_takes_over_again():
     """Oracle: by hand. The covariance of a bad scan is that of an unmeasured motion; the next good one knows nothing of it."""
     scans = [sweep(k) for k in range(6)]
     scans[4] = scans[4][:30]
-    frames = drive(scans, with_stream(NUMBERS))
+    frames = drive(scans, with_stream(NUMBERS), stamp_sigma_s=0.0)
     assert [frame.status for frame in frames] == ["ok"] * 4 + ["rejected", "ok"]
     unknown = np.repeat([np.radians(30.0) ** 2, 25.0], 3)
     np.testing.assert_allclose(np.diag(frames[4].motion.covariance), unknown, rtol=1e-9)
@@ -101,7 +113,7 @@ def test_what_is_lost_stays_in_the_world_and_leaves_the_motions():
     """Oracle: by hand: where the new street is was never measured, 5 m of standard deviation; motions on its map are known again."""
     boxes = np.array([[x, y, 1.0, 1.5, 3.0, 7.0 * x] for x in range(-30, 50, 7) for y in (-7.0, 8.0, 15.0)])
     there = [street.scan(pose_at(k), boxes=boxes, noise_m=0.01, seed=k).points for k in (20, 21, 22, 23)]
-    last = drive([sweep(k) for k in (0, 1, 2)] + there, with_stream(NUMBERS))[-1]
+    last = drive([sweep(k) for k in (0, 1, 2)] + there, with_stream(NUMBERS), stamp_sigma_s=0.0)[-1]
     assert last.status == "ok"
     assert np.all(np.diag(last.covariance)[3:] > 4.9**2)
     assert np.all(np.diag(last.motion.covariance)[3:] < 0.05**2)
@@ -110,7 +122,7 @@ def test_what_is_lost_stays_in_the_world_and_leaves_the_motions():
 def test_network_motion_chains_and_the_old_map_forgets_it():
     """Oracle: by hand. The network's motion adds to the world covariance; the scan after it is on the old map, as if it had not been."""
     scans = [*(sweep(k) for k in range(4)), in_a_crowd(4, 600), sweep(5)]
-    plain, frames = drive(scans, with_stream(None)), drive(scans, with_stream(NUMBERS))
+    plain, frames = drive(scans, with_stream(None), stamp_sigma_s=0.0), drive(scans, with_stream(NUMBERS), stamp_sigma_s=0.0)
     assert frames[4].motion.reason.startswith("the map does not fit")
     np.testing.assert_allclose(frames[4].covariance, composed(frames[3].covariance, frames[4]), rtol=1e-9)
     drift = frames[3].covariance - 0.3**2 * plain[3].motion.covariance

@@ -35,9 +35,14 @@ def chained(odometry: plans.Factors) -> np.ndarray:
     return np.stack(Ts)
 
 
+def multi_frame_pairs(num_poses: int) -> np.ndarray:
+    """(k, 2) frames two apart, and every fourth with the fourth next, as the paper has it."""
+    return np.array([(f, f + 2) for f in range(num_poses - 2)] + [(f, f + 4) for f in range(0, num_poses - 4, 4)])
+
+
 def noisy_plan(num_poses: int, seed: int) -> plans.Plan:
     """Odometry and multi-frame factors of a drive."""
     rng, Ts, number = np.random.default_rng(seed), drive(num_poses), np.arange(num_poses - 1)
     odometry = measured(Ts, np.stack([number, number + 1], 1), plans.ODOMETRY, rng)
-    multi = measured(Ts, plans.multi_frame_pairs(num_poses), plans.MULTI_FRAME, rng)
+    multi = measured(Ts, multi_frame_pairs(num_poses), plans.MULTI_FRAME, rng)
     return plans.Plan(chained(odometry), plans.joined([odometry, multi]))

@@ -11,7 +11,7 @@ from delo_jax.errors import DeloError
 from delo_jax.geometry import se3
 from delo_jax.refine import gtsam_backend, jax_backend
 from delo_jax.refine import plan as plans
-from tests.refine.graphs import drive, measured, noisy_plan
+from tests.refine.graphs import drive, measured, multi_frame_pairs, noisy_plan
 
 NUM_POSES = 12
 BACKENDS = {"gtsam": gtsam_backend.solve, "jax": jax_backend.solve}
@@ -76,7 +76,7 @@ def test_a_graph_without_noise_stays_as_it_is(backend):
     Ts, rng = drive(NUM_POSES), np.random.default_rng(5)
     number = np.arange(NUM_POSES - 1)
     steps = measured(Ts, np.stack([number, number + 1], 1), plans.ODOMETRY, rng, noise=0.0)
-    multi = measured(Ts, plans.multi_frame_pairs(NUM_POSES), plans.MULTI_FRAME, rng, noise=0.0)
+    multi = measured(Ts, multi_frame_pairs(NUM_POSES), plans.MULTI_FRAME, rng, noise=0.0)
     found = BACKENDS[backend](plans.Plan(Ts, plans.joined([steps, multi])))
     np.testing.assert_allclose(found.Ts_world_lidar, Ts, atol=1e-9)
 
