@@ -189,6 +189,7 @@ def _draw_errors(ax: Axes, error: np.ndarray, sigma: np.ndarray) -> None:
         middles, [np.quantile(error[part], 0.6827) for part in bins], color=COLORS[3], lw=1.4, marker="s", ms=3.5, label="68 % quantile"
     )
     ax.set(xscale="log", yscale="log", xlim=(low, high), ylim=(0.03 * low, 5.0 * high))
+    ax.xaxis.set_minor_formatter(NullFormatter())
     ax.grid(alpha=0.3)
 
 
