@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from delo_jax import inference, weights
 from delo_jax.cli import refine as command
+from delo_jax.cli import refinement
 from delo_jax.geometry import se3
 from delo_jax.inference import Estimate
 from delo_jax.refine import refiner
@@ -122,11 +123,19 @@ def test_loops_are_aligned_there_and_back(monkeypatch):
     np.testing.assert_allclose(kept.Ts_source_target, expected, atol=1e-9)
 
 
-def test_the_other_backend_gives_the_same_poses(folder, cli, tmp_path):
-    """Oracle: GTSAM's."""
+def test_the_other_backend_is_asked(folder, cli, tmp_path, monkeypatch):
+    """Oracle: the plan reaches it, and its poses the files; both backends are compared elsewhere."""
+    asked = []
+
+    def stand_in(plan):
+        asked.append(plan)
+        return refinement.BACKENDS["gtsam"](plan)
+
+    monkeypatch.setitem(refinement.BACKENDS, "jax", stand_in)
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("refined*"))
     assert cli("refine", copy, "--backend", "jax", "--no-loops").code == 0
+    assert len(asked) == 1
     np.testing.assert_allclose(np.loadtxt(copy / FILES[0]), np.loadtxt(folder / FILES[0]), atol=1e-5)
 
 

@@ -11,6 +11,7 @@ from delo_jax.errors import DeloError
 from delo_jax.geometry import se3
 from delo_jax.refine import gtsam_backend, jax_backend
 from delo_jax.refine import plan as plans
+from tests.fixtures import QUICKLY
 from tests.refine.graphs import drive, measured, multi_frame_pairs, noisy_plan
 
 NUM_POSES = 12
@@ -86,6 +87,7 @@ def test_a_wrong_loop_moves_nothing_that_others_hold(backend):
     """Oracle: the same graph without that loop, which is off by 5 m where sigmas are centimetres."""
     plan = noisy_plan(NUM_POSES, seed=6)
     wrong = plans.factors([0], [NUM_POSES - 1], np.eye(4)[None], 1e-4 * np.eye(6)[None], plans.LOOP)
+    plan = plan._replace(factors=plan.factors.rows(np.arange(len(plan.factors.sources) - 1)))  # as many as before: nothing is compiled anew
     without = gtsam_backend.solve(plan)
     found = BACKENDS[backend](plan._replace(factors=plans.joined([plan.factors, wrong])))
     moved = se3.log(se3.inverse(without.Ts_world_lidar) @ found.Ts_world_lidar)
@@ -93,13 +95,14 @@ def test_a_wrong_loop_moves_nothing_that_others_hold(backend):
     assert np.abs(moved[:, 3:]).max() < 0.02
 
 
+@pytest.mark.slow  # it compiles for long
 def test_the_solution_can_be_differentiated():
     """Oracle: central differences of GTSAM's solution for a turned factor."""
-    plan = noisy_plan(NUM_POSES, seed=7)
+    plan = noisy_plan(6, seed=7)
 
     def turned(angle):
         Ts = plan.factors.Ts_source_target.copy()
-        Ts[4] = Ts[4] @ se3.exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))
+        Ts[2] = Ts[2] @ se3.exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))
         return plan._replace(factors=plan.factors._replace(Ts_source_target=Ts))
 
     step = 1e-4
@@ -108,10 +111,10 @@ def test_the_solution_can_be_differentiated():
         problem = jax_backend.problem_of(plan)
 
         def end(angle):
-            T = problem.Ts_source_target[4] @ se3.exp(jnp.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]) * angle)
-            return jax_backend.refined_poses(problem._replace(Ts_source_target=problem.Ts_source_target.at[4].set(T)))[0][-1, 1, 3]
+            T = problem.Ts_source_target[2] @ se3.exp(jnp.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]) * angle)
+            return jax_backend.refined_poses(problem._replace(Ts_source_target=problem.Ts_source_target.at[2].set(T)))[0][-1, 1, 3]
 
-        gradient = float(jax.jit(jax.grad(end))(jnp.float64(0.0)))
+        gradient = float(jax.jit(jax.grad(end)).lower(jnp.float64(0.0)).compile(QUICKLY)(jnp.float64(0.0)))
     assert abs(gradient) > 0.1  # a metre a frame behind it
     np.testing.assert_allclose(gradient, (ends[0] - ends[1]) / (2 * step), rtol=1e-4)
 
