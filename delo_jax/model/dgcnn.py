@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from delo_jax.config import EncoderConfig
 from delo_jax.model.normalization import BatchNorm
+from delo_jax.ops.pooling import largest
 
 
 class EdgeConv(nn.Module):
@@ -23,7 +24,7 @@ class EdgeConv(nn.Module):
         center = nn.Dense(self.width, name="center")(h)
         edge = nn.Dense(self.width, use_bias=False, name="edge")(edges)
         hidden = nn.relu(neighbor[index] + center[:, None, :] + edge)
-        return nn.relu(jnp.max(nn.Dense(self.width, name="out")(hidden), axis=1))
+        return nn.relu(largest(nn.Dense(self.width, name="out")(hidden), 1))
 
 
 class EdgeEncoder(nn.Module):
@@ -81,7 +82,7 @@ class DGCNN(nn.Module):
             precision = "highest" if level == 0 else None  # metres go in: no TF32
             edges = nn.Dense(factor * self.width, use_bias=False, precision=precision, name=f"conv_{level}")(edges)
             edges = nn.relu(BatchNorm(self.train, name=f"norm_{level}")(edges, edge_mask))
-            levels.append(jnp.max(edges, axis=1))
+            levels.append(largest(edges, 1))
         features = nn.Dense(self.embedding_dim, use_bias=False, name="conv_out")(jnp.concatenate(levels, axis=-1))
         features = nn.relu(BatchNorm(self.train, name="norm_out")(features, mask))
         return jnp.where(mask[:, None], features, 0.0)

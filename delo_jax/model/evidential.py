@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 from delo_jax.config import EvidenceConfig
 from delo_jax.model.normalization import BatchNorm
+from delo_jax.ops.pooling import largest
 
 
 class EvidenceHead(nn.Module):
@@ -66,5 +67,5 @@ class PoseEvidenceHead(nn.Module):
 
 def _max_pool(features, mask):
     """Maximum of every channel over the valid rows; zeros when there is none."""
-    maximum = jnp.max(jnp.where(mask[:, None], features, -jnp.inf), axis=0)
+    maximum = largest(jnp.where(mask[:, None], features, -jnp.inf), 0)
     return jnp.where(jnp.any(mask), maximum, 0.0)

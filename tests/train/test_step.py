@@ -176,11 +176,11 @@ def test_evidence_learned_apart_moves_its_head_alone():
 
 @pytest.mark.parametrize("apart", [False, True])
 def test_evidence_has_a_slope_in_the_encoder_only_when_joint(apart):
-    """Oracle: the documented flow of gradients; of the evidence term alone, by block."""
+    """Oracle: the documented flow of gradients; of the evidence term alone, by block; compiled with other roundings."""
     cfg, _, _ = paper(apart=apart)
     variables = narrow_model("paper").variables
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=QUICKLY)
     @jax.grad
     def slope(params):
         model = delo.Model({**variables, "params": params}, cfg.model)
