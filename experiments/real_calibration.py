@@ -9,7 +9,7 @@ pooled; scans of raw drives are de-skewed with the motion estimated from the sam
 in brackets are 95 % ones of a bootstrap over blocks of ten frames. Rank correlation (Spearman) of |error| and predicted sigma.
 
 Run:     python experiments/real_calibration.py --data TREE       (about 10 minutes on 2 cores; figures go to runs/)
-Expect:  all bounds kept; gaps of 3 and 5 are printed without a bound.
+Expect:  6 of 12 bounds kept: rotations are over-covered, the lateral axis is not; gaps of 3 and 5 are printed without a bound.
 """
 
 import dataclasses
