@@ -10,6 +10,7 @@ Run:     python experiments/gate.py                        (about 10 minutes on 
 Expect:  all bounds kept; pictures in runs/calibrated.
 """
 
+import functools
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,8 +28,8 @@ from delo_jax.errors import WeightsError
 from delo_jax.model.delo import Model
 from delo_jax.report.calibration import cutoff_figure, gap_figure
 from delo_jax.sim import simulate_drive
-from delo_jax.train.calibrate import NUM_FRAMES, Pairs, doubts, halves, solved_pairs
-from delo_jax.train.worlds import CALIBRATION_SEED, stored_worlds
+from delo_jax.train.calibrate import Pairs, doubts, halves, stored_pairs
+from delo_jax.train.worlds import CALIBRATION_SEED
 from delo_jax.uncertainty import gate
 from delo_jax.uncertainty.observability import AXES
 
@@ -122,13 +123,8 @@ def main(argv: list[str] | None = None) -> int:
     found = {}
     with _harness.progress() as bar:
         for name, kind, seed in (("Worlds of the calibration", "calibration", CALIBRATION_SEED), ("Unseen worlds", "unseen", UNSEEN_SEED)):
-            task, folder, cfg = bar.add_task(name, total=count), args.out / "worlds", model.cfg.preprocess
-
-            def done(task=task):
-                bar.advance(task)
-
-            worlds = stored_worlds(folder, kind, count, seed, num_frames=NUM_FRAMES, cfg=cfg, on_world=done)
-            found[name] = judged(model, solved_pairs(model, worlds), quantiles)
+            step = functools.partial(bar.advance, bar.add_task(name, total=count))
+            found[name] = judged(model, stored_pairs(args.out / "worlds", kind, model, count, seed, on_world=step), quantiles)
             show(name, found[name])
         drives = [by_gap(model, DRIVE_SEED + k, kind, bar) for k, kind in enumerate(KINDS[:1] if args.quick else KINDS)]
     fitted, unseen = found.values()

@@ -13,33 +13,27 @@ Expect:  6 of 12 bounds kept: rotations are over-covered, the lateral axis is no
 """
 
 import dataclasses
-import functools
 from pathlib import Path
 from typing import NamedTuple
 
 import _harness
 import numpy as np
-import small_gicp
 from _harness import Row
-from _peers import NUM_THREADS, Drive, recorded
+from _peers import Drive, recorded
+from _truth import PRINTED, UNITS, noise_header, truth_noise
 from _uncertainty import deskewed, prepared_sweep, relative, solved
 from rich.progress import Progress
 from scipy.stats import spearmanr
 
 import delo_jax
-from delo_jax.geometry import se3
-from delo_jax.geometry.deskew import deskew
 from delo_jax.metrics.calibration import block_interval, coverage, nees
 from delo_jax.model.delo import Model
-from delo_jax.pipeline.motion_model import NANOSECOND
 from delo_jax.report.calibration import error_figure, reliability_figure
 from delo_jax.uncertainty.observability import AXES
 
 DRIVES = ("raw_0926_0013", "odo_04_000")
 GAPS, NUM_POINTS, BLOCK = (1, 3, 5), (256, 1024), 10
 LEVELS, BOUNDED_LEVELS, POINTS = (0.5, 0.68, 0.9, 0.95, 0.99), (0.68, 0.95), 10.0
-PRINTED = np.repeat([1e3, 100.0], 3)  # mrad, cm
-UNITS = ("mrad",) * 3 + ("cm",) * 3
 
 
 class Measured(NamedTuple):
@@ -55,37 +49,6 @@ class Measured(NamedTuple):
     def total(self) -> np.ndarray:
         """(n, 6, 6) covariances with the noise of the truth."""
         return self.covariances + self.noise[:, :, None] ** 2 * np.eye(6)[None]
-
-
-def compensated(drive: Drive) -> list[np.ndarray]:
-    """Points of every sweep, de-skewed with the true velocity where they carry times."""
-    if not drive.skewed:
-        return [sweep.points for sweep in drive.sweeps]
-    found = []
-    for k, sweep in enumerate(drive.sweeps):
-        first, last = max(k - 1, 0), min(k + 1, len(drive.sweeps) - 1)
-        motion = se3.inverse(drive.Ts_world_lidar[first]) @ drive.Ts_world_lidar[last]
-        velocity = se3.log(motion) / ((drive.sweeps[last].stamp_ns - drive.sweeps[first].stamp_ns) * NANOSECOND)
-        found.append(sweep.points if sweep.times_s is None else deskew(sweep.points, sweep.times_s, velocity))
-    return found
-
-
-def truth_noise(drive: Drive, bar: Progress) -> dict[int, np.ndarray]:
-    """By gap, (6,) standard deviations of the truth of a pair."""
-    prepare = functools.partial(small_gicp.preprocess_points, downsampling_resolution=0.25, num_threads=NUM_THREADS)
-    clouds = [prepare(points.astype(np.float64)) for points in bar.track(compensated(drive), description=f"{drive.name}: GICP's clouds")]
-    found = {}
-    for gap in GAPS:
-        errors = []
-        for k in bar.track(range(len(clouds) - gap), description=f"{drive.name}: GICP at gap {gap}"):
-            T_true, (target, tree) = relative(drive.Ts_world_lidar, k, k + gap), clouds[k + gap]
-            result = small_gicp.align(target, clouds[k][0], tree, T_true, max_correspondence_distance=1.0, num_threads=NUM_THREADS)
-            errors.append(se3.log(se3.inverse(se3.orthonormal(np.asarray(result.T_target_source))) @ T_true))
-        middle = np.median(errors, axis=0)
-        found[gap] = 1.4826 * np.median(np.abs(np.array(errors) - middle[None]), axis=0)
-        cells = " | ".join(f"{value:.2f}" for value in PRINTED * found[gap])
-        print(f"| {drive.name} | {gap} | {len(errors)} | {cells} | {', '.join(f'{value:.2f}' for value in PRINTED * middle)} |", flush=True)
-    return found
 
 
 def measured(models: dict[int, Model], drive: Drive, noise: dict[int, np.ndarray], first_block: int, bar: Progress) -> dict[int, Measured]:
@@ -150,9 +113,8 @@ def main(argv: list[str] | None = None) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     with _harness.progress() as bar:
         drives = [recorded(args.data, name, 16 if args.quick else None, bar) for name in args.drives]
-        print(f"| drive | gap | pairs | {' | '.join(f'{axis}: {unit}' for axis, unit in zip(AXES, UNITS, strict=True))} | medians |")
-        print(f"|---|---:|---:|{'---:|' * 6}---|")
-        noises = [truth_noise(drive, bar) for drive in drives]
+        print(noise_header())
+        noises = [truth_noise(drive, GAPS, bar) for drive in drives]
         parts, num_blocks = [], 0
         for drive, noise in zip(drives, noises, strict=True):
             parts.append(measured(models, drive, noise, num_blocks, bar))

@@ -30,7 +30,7 @@ class Calibrate(Command):
     weights: tyro.conf.Positional[str] = "delo-base"
     """Name of released weights, or a .safetensors file with its card."""
     out: Path = Path("runs/calibrated")
-    """Folder for worlds, drives and the calibrated weights; what is there is not made again."""
+    """Folder for worlds, solved pairs, drives and the calibrated weights; what is there is not made again."""
     num_worlds: int = 900
     """Simulated worlds, thirty pairs each: a second or two each on two cores. 0: the covariance of a pair stays as it is."""
     num_drives: int = 16
@@ -58,7 +58,7 @@ class Calibrate(Command):
                     model, about = stage(model)
                     rest[name] = {"command": command} | about
         except KeyboardInterrupt:
-            what = "worlds and drives are kept, to go on"
+            what = "worlds, pairs and drives are kept, to go on"
             print(f"delo: interrupted; {what}: {command} --out {shlex.quote(str(self.out))}", file=sys.stderr)
             return 1
         path = weights.save(self.out / Path(self.weights).stem, model, rest)
@@ -68,21 +68,14 @@ class Calibrate(Command):
     def _pairs(self, model: "Model") -> tuple["Model", dict[str, Any]]:
         """The covariance of a pair, and what the card says of it."""
         from delo_jax.cli.console import progress
-        from delo_jax.train.calibrate import NUM_FOLDS, NUM_FRAMES, calibrate, solved_pairs
-        from delo_jax.train.worlds import CALIBRATION_SEED, stored_worlds
+        from delo_jax.train.calibrate import NUM_FOLDS, calibrate, stored_pairs
+        from delo_jax.train.worlds import CALIBRATION_SEED
 
         with progress("worlds") as bar:
-            task = bar.add_task("simulating and solving", total=self.num_worlds, note="")
-            worlds = stored_worlds(
-                self.out / "worlds",
-                "calibration",
-                self.num_worlds,
-                CALIBRATION_SEED,
-                num_frames=NUM_FRAMES,
-                cfg=model.cfg.preprocess,
-                on_world=lambda: bar.update(task, advance=1),
+            task, folder = bar.add_task("simulating and solving", total=self.num_worlds, note=""), self.out / "worlds"
+            pairs = stored_pairs(
+                folder, "calibration", model, self.num_worlds, CALIBRATION_SEED, on_world=lambda: bar.update(task, advance=1)
             )
-            pairs = solved_pairs(model, worlds)
             fits = bar.add_task("fitting", total=NUM_FOLDS + 1, note="")
             calibrated, covariances = calibrate(model, pairs, lambda: bar.update(fits, advance=1))
         good = ~pairs.lost(model)

@@ -1,8 +1,11 @@
 """Covariances that fit the errors: pairs of worlds that no training has seen, and a small head fitted on them."""
 
+import hashlib
 import itertools
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +19,7 @@ from delo_jax.geometry import se3
 from delo_jax.model import delo
 from delo_jax.ops import spread
 from delo_jax.ops.evidence import NIG
-from delo_jax.train.worlds import World, scan_of
+from delo_jax.train.worlds import SIMULATOR, World, scan_of, stored_world, write_arrays
 from delo_jax.uncertainty import gate
 
 NUM_FRAMES = 6
@@ -52,25 +55,63 @@ class Pairs(NamedTuple):
         return far | (np.linalg.norm(self.errors[:, :3], axis=1) > np.radians(limits.lost_rotation_deg))
 
 
-def solved_pairs(model: delo.Model, worlds: Iterable[World], frames: Sequence[tuple[int, int]] | None = None) -> Pairs:
-    """Pairs of every world, from the identity and without a motion prior.
+def stored_pairs(
+    folder: Path, name: str, model: delo.Model, count: int, seed: int, *, on_world: Callable[[], None] = lambda: None
+) -> Pairs:
+    """Pairs of the worlds `seed`, `seed + 1`, ..., read from `folder`, or solved and written there with their worlds.
 
     Args:
+        folder: store; pairs of other weights do not get mixed up, since the file name holds a fingerprint.
+        name: of these worlds.
         model: weights.
-        worlds: of `NUM_FRAMES` scans each.
-        frames: (source, target) of the pairs of a world; all of `FRAMES` by default.
+        count: how many worlds.
+        seed: of the first.
+        on_world: called after each world, for progress.
     """
-    rows = []
-    for number, world in enumerate(worlds):
-        encodings = [inference.encode(model, scan_of(world, frame, model.cfg.preprocess)) for frame in range(NUM_FRAMES)]
-        for source, target in FRAMES if frames is None else frames:
-            result = jax.device_get(inference.solve(model, encodings[source], encodings[target], jnp.eye(4)))
-            T_true = se3.inverse(world.Ts_world_lidar[target]) @ world.Ts_world_lidar[source]
-            T = se3.orthonormal(np.asarray(result.T_target_source, np.float64))
-            error = se3.log(se3.inverse(T) @ T_true)
-            rest = result.statistics, result.nig, result.confidence, result.information
-            rows.append(Pairs(error, T, *rest, np.array(number), np.array(target - source)))
+    folder.mkdir(parents=True, exist_ok=True)
+    key, rows = fingerprint(model, SIMULATOR, seed, FRAMES), []
+    for index in range(count):
+        path = folder / f"{name}_pairs_{key}_{index:05d}.npz"
+        if not path.exists():
+            world = stored_world(folder, name, index, seed, num_frames=NUM_FRAMES, cfg=model.cfg.preprocess)
+            pairs = solved_pairs(model, world, index)
+            write_arrays(path, **{field: array for field, array in pairs._asdict().items() if field != "nig"}, **pairs.nig._asdict())
+        with np.load(path) as stored:
+            nig = NIG(*(stored[field] for field in NIG._fields))
+            rows.append(Pairs(**{field: nig if field == "nig" else stored[field] for field in Pairs._fields}))
+        on_world()
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *rows)
+
+
+def fingerprint(model: delo.Model, *what: Any) -> str:
+    """Eight characters that change with the network, its settings, or anything else that results depend on; not with a calibration."""
+    cfg = replace(model.cfg, evidence=replace(model.cfg.evidence, covariance_width=0))
+    digest = hashlib.sha256(json.dumps([*what, asdict(cfg)]).encode())
+    for array in jax.tree.leaves(jax.device_get(model.variables["params"])):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:8]
+
+
+def solved_pairs(model: delo.Model, world: World, number: int) -> Pairs:
+    """The pairs `FRAMES` of a world of `NUM_FRAMES` scans, from the identity and without a motion prior."""
+    encodings, rows = [inference.encode(model, scan_of(world, frame, model.cfg.preprocess)) for frame in range(NUM_FRAMES)], []
+    for source, target in FRAMES:
+        T_true = se3.inverse(world.Ts_world_lidar[target]) @ world.Ts_world_lidar[source]
+        rows.append(solved_pair(model, encodings[source], encodings[target], T_true)._replace(gaps=np.array(target - source)))
+    return joined(rows)._replace(worlds=np.full(len(rows), number))
+
+
+def joined(rows: Sequence[Pairs]) -> Pairs:
+    """Single rows as a table."""
     return jax.tree.map(lambda *arrays: np.stack(arrays), *rows)
+
+
+def solved_pair(model: delo.Model, source: delo.Encoding, target: delo.Encoding, T_true: np.ndarray) -> Pairs:
+    """One row, from the identity and without a motion prior: of world 0, at gap 1."""
+    result = jax.device_get(inference.solve(model, source, target, jnp.eye(4)))
+    T = se3.orthonormal(np.asarray(result.T_target_source, np.float64))
+    error = se3.log(se3.inverse(T) @ T_true)
+    return Pairs(error, T, result.statistics, result.nig, result.confidence, result.information, np.array(0), np.array(1))
 
 
 def halves(model: delo.Model, weights: spread.Weights, pairs: Pairs) -> np.ndarray:
@@ -99,7 +140,7 @@ def fit(
 
     Args:
         model: weights.
-        pairs: from `solved_pairs`.
+        pairs: from `stored_pairs`.
         seed: of the hidden layer's start.
         likelihood: minus the logarithm of it, of one pair.
         more: start of further numbers that this likelihood reads from the weights.
@@ -130,7 +171,7 @@ def calibrate(model: delo.Model, pairs: Pairs, on_fit: Callable[[], None] = lamb
 
     Args:
         model: weights.
-        pairs: from `solved_pairs`.
+        pairs: from `stored_pairs`.
         on_fit: called after each of the five fits, for progress.
     """
     unseen = np.zeros((len(pairs.errors), 6, 6))

@@ -1,10 +1,7 @@
 """Covariances of a drive on a map that fit the errors: simulated drives that no training has seen, and the numbers of `stream` fitted."""
 
-import hashlib
-import json
-import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,8 +18,8 @@ from delo_jax.model.delo import Model
 from delo_jax.pipeline.lidar_odometry import LidarOdometry
 from delo_jax.pipeline.motion_model import NANOSECOND
 from delo_jax.sim import KINDS, simulate_drive
-from delo_jax.train.calibrate import LEVELS
-from delo_jax.train.worlds import SIMULATOR
+from delo_jax.train.calibrate import LEVELS, fingerprint
+from delo_jax.train.worlds import SIMULATOR, write_arrays
 from delo_jax.uncertainty import stream
 from delo_jax.uncertainty.stream import StreamNoise
 
@@ -99,19 +96,14 @@ def stored_drives(
         on_scan: called after each scan, for progress.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    digest = hashlib.sha256(json.dumps([SIMULATOR, TRACKER, asdict(model.cfg), num_scans]).encode())
-    for array in jax.tree.leaves(jax.device_get(model.variables["params"])):
-        digest.update(np.ascontiguousarray(array).tobytes())
+    key = fingerprint(model, SIMULATOR, TRACKER, num_scans)
     for number in range(seed, seed + count):
-        path = folder / f"drive_{digest.hexdigest()[:8]}_{number:07d}.npz"
+        path = folder / f"drive_{key}_{number:07d}.npz"
         if path.exists():
             for _ in range(num_scans):
                 on_scan()
         else:
-            drive, part = register_drive(model, number, num_scans, on_scan), path.with_suffix(".part")
-            with part.open("wb") as file:
-                np.savez(file, **drive._asdict())
-            os.replace(part, path)
+            write_arrays(path, **register_drive(model, number, num_scans, on_scan)._asdict())
         with np.load(path) as stored:
             yield Drive(*(stored[name] for name in Drive._fields))
 

@@ -103,7 +103,7 @@ def worlds(cfg: TrainConfig, folder: Path, *, validation: bool, on_world: Callab
 def stored_worlds(
     folder: Path, name: str, count: int, seed: int, *, num_frames: int, cfg: PreprocessConfig, on_world: Callable[[], None] = lambda: None
 ) -> Iterator[World]:
-    """Worlds `seed`, `seed + 1`, ..., read from `folder` or simulated and written there.
+    """Worlds `seed`, `seed + 1`, ..., of `stored_world`, one after the other.
 
     Args:
         folder: store; may hold worlds of several names.
@@ -114,23 +114,32 @@ def stored_worlds(
         cfg: preprocessing of the scans.
         on_world: called after each world, for progress.
     """
+    for index in range(count):
+        yield stored_world(folder, name, index, seed, num_frames=num_frames, cfg=cfg)
+        on_world()
+
+
+def stored_world(folder: Path, name: str, index: int, seed: int, *, num_frames: int, cfg: PreprocessConfig) -> World:
+    """World `seed + index`, read from `folder` or simulated and written there."""
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps([SIMULATOR, asdict(stored_config(cfg)), num_frames, seed])
-    fingerprint = hashlib.sha256(text.encode()).hexdigest()[:8]
-    for index in range(count):
-        path = folder / f"{name}_{fingerprint}_{index:05d}.npz"
-        if not path.exists():
-            write_world(path, make_world(index, seed=seed, num_frames=num_frames, cfg=cfg))
-        yield read_world(path)
-        on_world()
+    path = folder / f"{name}_{hashlib.sha256(text.encode()).hexdigest()[:8]}_{index:05d}.npz"
+    if not path.exists():
+        write_world(path, make_world(index, seed=seed, num_frames=num_frames, cfg=cfg))
+    return read_world(path)
 
 
 def write_world(path: Path, world: World) -> None:
     """Store a world; a file that is there is whole."""
-    part = path.with_suffix(".part")
     halves = {name: array.astype(np.float16) if name in ("normals", "features") else array for name, array in world.scans._asdict().items()}
+    write_arrays(path, **halves, Ts_world_lidar=world.Ts_world_lidar)
+
+
+def write_arrays(path: Path, **arrays: np.ndarray) -> None:
+    """An npz file that is whole as soon as it is there."""
+    part = path.with_suffix(".part")
     with part.open("wb") as file:
-        np.savez(file, **halves, Ts_world_lidar=world.Ts_world_lidar)
+        np.savez(file, **arrays)
     os.replace(part, path)
 
 

@@ -89,19 +89,41 @@ def test_student_fit_finds_the_degrees_of_freedom(model, monkeypatch, freedom):
     assert np.median(np.abs(np.log(sigma / true))) < 0.2
 
 
-def test_pairs_of_a_world_are_solved_and_measured(model, monkeypatch):
-    """Oracle: two worlds of one scan seen again and again: the truth of every pair is the identity."""
+def test_pairs_of_a_world_are_solved_once_and_measured(model, monkeypatch, tmp_path):
+    """Oracle: worlds of one scan seen again and again: the truth of every pair is the identity; a store is read, not made again."""
     from delo_jax.preprocess import Scan, preprocess
-    from delo_jax.train.worlds import World
+    from delo_jax.train import worlds
     from tests.oracles import street
 
     scan = preprocess(street.scan(street.pose()).points, model.cfg.preprocess)
-    world = World(Scan(*(np.stack([array] * module.NUM_FRAMES) for array in scan)), np.tile(street.pose(), (module.NUM_FRAMES, 1, 1)))
+    world = worlds.World(
+        Scan(*(np.stack([array] * module.NUM_FRAMES) for array in scan)), np.tile(street.pose(), (module.NUM_FRAMES, 1, 1))
+    )
+    made = []
+
+    def make_world(index, *, seed, **settings):
+        made.append(seed + index)
+        return world
+
+    monkeypatch.setattr(worlds, "make_world", make_world)
     monkeypatch.setattr(module, "FRAMES", ((0, 1), (5, 2)))
-    pairs = module.solved_pairs(model, [world, world])
+    pairs = module.stored_pairs(tmp_path, "some", model, 2, 500)
+    assert made == [500, 501]
     assert pairs.errors.shape == (4, 6)
-    assert module.solved_pairs(model, [world], ((2, 4),)).gaps.tolist() == [2]
     np.testing.assert_array_equal(pairs.worlds, [0, 0, 1, 1])
     np.testing.assert_array_equal(pairs.gaps, [1, -3, 1, -3])
     for error, T in zip(pairs.errors, pairs.Ts_target_source, strict=True):
         np.testing.assert_allclose(np.linalg.norm(error[3:]), np.linalg.norm(np.linalg.inv(T)[:3, 3]), rtol=0.2, atol=1e-6)
+    monkeypatch.setattr(module, "solved_pairs", None)
+    for first, again in zip(jax.tree.leaves(pairs), jax.tree.leaves(module.stored_pairs(tmp_path, "some", model, 2, 500)), strict=True):
+        np.testing.assert_array_equal(first, again)
+
+
+def test_fingerprint_tells_networks_apart_but_not_calibrations(model):
+    """Oracle: what a pair's solution depends on."""
+    from dataclasses import replace
+
+    other = delo.init(PRESETS["tiny"].model, jax.random.key(1))
+    calibrated = replace(model, cfg=replace(model.cfg, evidence=replace(model.cfg.evidence, covariance_width=8)))
+    assert module.fingerprint(model, 1) == module.fingerprint(calibrated, 1)
+    assert len({module.fingerprint(model, 1), module.fingerprint(model, 2), module.fingerprint(other, 1)}) == 3
