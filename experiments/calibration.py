@@ -50,7 +50,7 @@ from delo_jax.train.worlds import CALIBRATION_SEED, scan_of, stored_world
 from delo_jax.uncertainty.observability import AXES
 
 UNSEEN_SEED, DRIVE_SEED = 1_600_000, 1_720_000
-NUM_UNSEEN, NUM_FITTED, NUM_QUICK = 150, 900, 4
+NUM_UNSEEN, NUM_FITTED, NUM_QUICK = 300, 900, 4
 NUM_DRIVES, NUM_SCANS, NUM_QUICK_SCANS = 6, 121, 13
 STEPS = (10, 100)  # frames, of pairs in a row
 LEVELS = (0.5, 0.68, 0.9, 0.95, 0.99)

@@ -56,7 +56,7 @@ def simulate_clip(
         rolling_shutter_share: share of clips delivered as measured.
         traffic: density of the moving traffic, as a factor > 0.
     """
-    sensor = _resolve(sensor, num_columns)
+    sensor = resolve(sensor, num_columns)
     rng = np.random.default_rng([seed, KINDS.index(kind), 5])
     turning, rolling_shutter = rng.uniform() < turning_share, bool(rng.uniform() < rolling_shutter_share)
     motion_seed, unit_seed, noise_seed = (int(s) for s in rng.integers(0, 2**31, 3))
@@ -96,7 +96,7 @@ def simulate_drive(
         rolling_shutter: deliver points as measured rather than motion-compensated.
         max_speed: upper bound of the speed [m/s].
     """
-    sensor = _resolve(sensor, None)
+    sensor = resolve(sensor, None)
     style, ground, warp = draw_world(kind, seed)
     duration_s, top_speed = num_scans * sensor.period_s, min(max_speed, safe_speed(warp))
     motion = make_motion(seed, duration_s, max_speed=top_speed, start_s=-sensor.period_s)
@@ -166,7 +166,8 @@ def _started(primitives: Primitives, stamp_s: float) -> Primitives:
     return primitives._replace(center=center)
 
 
-def _resolve(sensor: str | Sensor, num_columns: int | None) -> Sensor:
+def resolve(sensor: str | Sensor, num_columns: int | None) -> Sensor:
+    """A model of sensor by its name, with another number of columns if there is one."""
     if isinstance(sensor, str) and sensor not in SENSORS:
         raise ConfigError(f"sensor: expected one of {', '.join(SENSORS)}, got {sensor!r}")
     model = SENSORS[sensor] if isinstance(sensor, str) else sensor

@@ -101,16 +101,16 @@ def make_chunk(style: Style, seed: int, index: int) -> Primitives:
     primitives = builder.build()
     sin, cos = np.sin(primitives.yaw), np.cos(primitives.yaw)
     reach = np.abs(sin) * primitives.half_size[:, 0] + np.abs(cos) * primitives.half_size[:, 1]
-    return _without(primitives, _at_body_height(primitives) & (np.abs(primitives.center[:, 1]) - reach < LANE_HALF_M))
+    return without(primitives, at_body_height(primitives) & (np.abs(primitives.center[:, 1]) - reach < LANE_HALF_M))
 
 
-def _at_body_height(primitives: Primitives) -> Bool[np.ndarray, " n"]:
+def at_body_height(primitives: Primitives) -> Bool[np.ndarray, " n"]:
     """Whether a shape is in a vehicle's way: neither a kerb nor high above the road."""
     z, half_z = primitives.center[:, 2], primitives.half_size[:, 2]
     return (z + half_z > 0.3) & (z - half_z < 2.8)
 
 
-def _without(primitives: Primitives, unwanted: Bool[np.ndarray, " n"]) -> Primitives:
+def without(primitives: Primitives, unwanted: Bool[np.ndarray, " n"]) -> Primitives:
     """The primitives without the objects that have an unwanted shape."""
     return take(primitives, ~np.isin(primitives.object_id, primitives.object_id[unwanted]))
 
@@ -129,7 +129,7 @@ def clear_path(scene: Scene, motion: Motion) -> Scene:
 
     Kerbs and what hangs high above the road stay.
     """
-    return scene._replace(primitives=_without(scene.primitives, _blocking(scene.primitives, motion)))
+    return scene._replace(primitives=without(scene.primitives, _blocking(scene.primitives, motion)))
 
 
 def _blocking(primitives: Primitives, motion: Motion) -> Bool[np.ndarray, " n"]:
@@ -141,7 +141,7 @@ def _blocking(primitives: Primitives, motion: Motion) -> Bool[np.ndarray, " n"]:
         dx, dy = (motion.position[i] - moved).T
         outside = np.abs(np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=1)) - primitives.half_size[:, :2]
         near |= np.linalg.norm(np.maximum(outside, 0.0), axis=1) < CLEARANCE_M
-    return near & _at_body_height(primitives)
+    return near & at_body_height(primitives)
 
 
 def match_traffic(scene: Scene, motion: Motion, seed: int) -> Scene:

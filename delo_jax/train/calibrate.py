@@ -29,7 +29,6 @@ WEIGHT_DECAY = 1e-2
 NUM_FOLDS = 4
 MAX_STEPS = 1000
 LEVELS = (0.68, 0.95)  # coverages between which the last scale of each axis is chosen
-MOST_ABOVE = 0.04  # what the coverage at the first of them may be too high by
 
 
 class Pairs(NamedTuple):
@@ -166,8 +165,8 @@ def calibrate(model: delo.Model, pairs: Pairs, on_fit: Callable[[], None] = lamb
     """The model with a fitted covariance and the gate's quantiles, and covariances (n, 6, 6) of the pairs by fits without their worlds.
 
     Covariances of worlds that a fit has seen are too small for others; by how much, the unseen ones say. Each axis, in the frame of the
-    motion, is scaled by the geometric mean of the factors that its coverage at 68 and at 95 % asks for: errors have heavier tails than
-    a Gaussian, so that no one factor satisfies both. It is scaled by less where more than 72 % would be covered at 68 %.
+    motion, is scaled so that its coverage at 68 % is too high by no more than that at 95 % is too low: errors have heavier tails than a
+    Gaussian, so that no one factor satisfies both.
 
     Args:
         model: weights.
@@ -196,11 +195,10 @@ def calibrate(model: delo.Model, pairs: Pairs, on_fit: Callable[[], None] = lamb
 
 
 def _scale(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
-    """(6,) what the standard deviations have to be multiplied by."""
+    """(6,) what the standard deviations have to be multiplied by, for coverages that add up to those of a Gaussian."""
     sizes = np.abs(errors) / np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    factors = [np.quantile(sizes, level, axis=0) / norm.ppf(0.5 + 0.5 * level) for level in LEVELS]
-    most = np.quantile(sizes, LEVELS[0] + MOST_ABOVE, axis=0) / norm.ppf(0.5 + 0.5 * LEVELS[0])
-    return np.minimum(np.exp(np.mean(np.log(factors), axis=0)), most)
+    wanted = [sizes / norm.ppf(0.5 + 0.5 * level) for level in LEVELS]
+    return np.quantile(np.concatenate(wanted), np.mean(LEVELS), axis=0)
 
 
 def _said(pairs: Pairs, units) -> jax.Array:
