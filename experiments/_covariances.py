@@ -74,10 +74,11 @@ def methods(model: Model, seen: Pairs) -> dict[str, Method]:
 
 def ensemble(model: Model, seen: Pairs) -> list[spread.Weights]:
     """Heads that are fitted on as many worlds, drawn with repetition."""
-    rows_of, heads = [np.flatnonzero(seen.worlds == world) for world in np.unique(seen.worlds)], []
+    _, number_of = np.unique(seen.worlds, return_inverse=True)
+    num, heads = number_of.max() + 1, []
     for number in range(NUM_HEADS):
-        drawn = np.random.default_rng(number).integers(len(rows_of), size=len(rows_of))
-        heads.append(fit(model, seen.rows(np.concatenate([rows_of[world] for world in drawn])), seed=number))
+        drawn = np.bincount(np.random.default_rng(number).integers(num, size=num), minlength=num)
+        heads.append(fit(model, seen, drawn[number_of], seed=number))
     return heads
 
 

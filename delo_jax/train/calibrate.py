@@ -1,5 +1,6 @@
 """Covariances that fit the errors: pairs of worlds that no training has seen, and a small head fitted on them."""
 
+import functools
 import hashlib
 import itertools
 import json
@@ -130,6 +131,7 @@ def doubts(model: delo.Model, weights: spread.Weights, pairs: Pairs) -> np.ndarr
 def fit(
     model: delo.Model,
     pairs: Pairs,
+    counts: np.ndarray | None = None,
     *,
     seed: int = 0,
     likelihood: Callable[..., jax.Array] = spread.negative_log_likelihood,
@@ -140,25 +142,35 @@ def fit(
     Args:
         model: weights.
         pairs: from `stored_pairs`.
+        counts: (n,) how many times each pair counts, 0 for none; once each by default.
         seed: of the hidden layer's start.
         likelihood: minus the logarithm of it, of one pair.
         more: start of further numbers that this likelihood reads from the weights.
     """
-    pairs = pairs.rows(np.flatnonzero(~pairs.lost(model)))
+    counts = np.where(pairs.lost(model), 0, np.ones(len(pairs.errors), int) if counts is None else counts)
     units = delo.evidence_units(model.cfg)
     said = _said(pairs, units)
     start = spread.init(said.shape[1], WIDTH, jax.random.key(seed)) | (more or {})
-    fixed = {"mean": jnp.mean(said, axis=0), "deviation": jnp.std(said, axis=0) + 1e-3, "whitener": spread.whitener(said)}
-    by_pair = jax.vmap(likelihood, in_axes=(None, 0, 0, 0, None))
-
-    def loss(free, rows):
-        decay = sum(jnp.sum(free[name] ** 2) for name in ("hidden", "out", "direct"))
-        return jnp.mean(by_pair(free | fixed, *rows, units)) + WEIGHT_DECAY * decay
-
+    counted = said[np.repeat(np.arange(len(counts)), counts)]
+    fixed = {"mean": jnp.mean(counted, axis=0), "deviation": jnp.std(counted, axis=0) + 1e-3, "whitener": spread.whitener(counted)}
     free = {name: array for name, array in start.items() if name not in fixed}
     rows = said, jnp.asarray(pairs.Ts_target_source, jnp.float32), jnp.asarray(pairs.errors, jnp.float32)
     solver: Any = optimistix.BFGS(rtol=1e-5, atol=1e-6)
-    return optimistix.minimise(loss, solver, free, args=rows, max_steps=MAX_STEPS, throw=False).value | fixed
+    given = fixed, jnp.asarray(counts, jnp.float32), rows, units
+    return optimistix.minimise(_loss(likelihood), solver, free, args=given, max_steps=MAX_STEPS, throw=False).value | fixed
+
+
+@functools.cache
+def _loss(likelihood: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """What a fit minimises; one function for all fits, so that it is compiled once."""
+    by_pair = jax.vmap(likelihood, in_axes=(None, 0, 0, 0, None))
+
+    def loss(free, given):
+        fixed, counts, rows, units = given
+        decay = sum(jnp.sum(free[name] ** 2) for name in ("hidden", "out", "direct"))
+        return jnp.sum(counts * by_pair(free | fixed, *rows, units)) / jnp.sum(counts) + WEIGHT_DECAY * decay
+
+    return loss
 
 
 def calibrate(model: delo.Model, pairs: Pairs, on_fit: Callable[[], None] = lambda: None) -> tuple[delo.Model, np.ndarray]:
@@ -176,7 +188,7 @@ def calibrate(model: delo.Model, pairs: Pairs, on_fit: Callable[[], None] = lamb
     unseen = np.zeros((len(pairs.errors), 6, 6))
     for fold in range(NUM_FOLDS):
         away = pairs.worlds % NUM_FOLDS == fold
-        H = halves(model, fit(model, pairs.rows(np.flatnonzero(~away))), pairs.rows(np.flatnonzero(away)))
+        H = halves(model, fit(model, pairs, np.where(away, 0, 1)), pairs.rows(np.flatnonzero(away)))
         unseen[away] = H @ H.transpose(0, 2, 1)
         on_fit()
     good = ~pairs.lost(model)

@@ -146,7 +146,7 @@ def test_order_of_the_points_does_not_matter(preset, side):
     np.testing.assert_allclose(there.confidence, here.confidence, atol=1e-3)
 
 
-@pytest.mark.parametrize("preset", NARROW)
+@pytest.mark.parametrize("preset", [pytest.param(name, marks=() if name in RAW else pytest.mark.slow) for name in NARROW])
 def test_one_at_a_time_several_or_not_compiled(preset):
     """Oracle: the same function in a loop, compiled and not; float32 sums in another order."""
     model = narrow_model(preset)
