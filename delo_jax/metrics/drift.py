@@ -10,6 +10,25 @@ from delo_jax.errors import DeloError
 from delo_jax.metrics._poses import checked_pair
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+KITTI_SPEEDS_MPS = tuple(np.arange(2.0, 25.0, 2.0).tolist())
+"""Centres of the benchmark's classes of speed. A class reaches 2 m/s to either side, so that neighbours overlap."""
+KITTI_FRAME_S = 0.1
+KITTI_MIN_SEGMENTS = 3
+"""Classes with fewer segments are not plotted by the benchmark."""
+_SPEED_REACH_MPS = 2.0
+
+
+class Segments(NamedTuple):
+    """Errors of s segments of one track, or of several."""
+
+    lengths_m: Float64[np.ndarray, " k"]
+    """The segment lengths asked for."""
+    which: Int64[np.ndarray, " s"]
+    """Index of each segment's length."""
+    speed_mps: Float64[np.ndarray, " s"]
+    """Length over time, a frame lasting 0.1 s and a segment as many frames as it touches."""
+    t_rel_percent: Float64[np.ndarray, " s"]
+    r_rel_deg_per_100m: Float64[np.ndarray, " s"]
 
 
 class Drift(NamedTuple):
@@ -29,6 +48,18 @@ class Drift(NamedTuple):
     num_segments_by_length: Int64[np.ndarray, " k"]
 
 
+class SpeedDrift(NamedTuple):
+    """Mean drift over all segments that were driven at about the same speed."""
+
+    speeds_mps: Float64[np.ndarray, " k"]
+    """Centres of the classes; the three tables below have one entry for each."""
+    t_rel_percent: Float64[np.ndarray, " k"]
+    """NaN where no segment was driven at this speed."""
+    r_rel_deg_per_100m: Float64[np.ndarray, " k"]
+    """NaN where no segment was driven at this speed."""
+    num_segments: Int64[np.ndarray, " k"]
+
+
 def kitti_drift(
     Ts_estimated: Float[np.ndarray, "n 4 4"],
     Ts_true: Float[np.ndarray, "m 4 4"],
@@ -36,21 +67,33 @@ def kitti_drift(
     lengths_m: Sequence[float] = KITTI_LENGTHS_M,
     step: int = 10,
 ) -> Drift:
-    """Relative error over all sub-sequences of given lengths (Geiger et al. 2012, the odometry devkit).
+    """Mean drift of one track: `mean_drift` of its `segment_errors`, which see."""
+    return mean_drift(segment_errors(Ts_estimated, Ts_true, lengths_m=lengths_m, step=step))
+
+
+def segment_errors(
+    Ts_estimated: Float[np.ndarray, "n 4 4"],
+    Ts_true: Float[np.ndarray, "m 4 4"],
+    *,
+    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    step: int = 10,
+) -> Segments:
+    """Relative errors of all sub-sequences of given lengths (Geiger et al. 2012, the odometry devkit).
 
     From every `step`-th frame i and for every length L, frame j is the first whose distance along the *true* path from i is
-    greater than L. The error of the segment is (E_i^-1 E_j)^-1 (G_i^-1 G_j): its translation and its angle are divided by L, and
-    all segments weigh the same in the mean. Inverses are general and the angle is read off the trace, as in the devkit: published
-    trajectories hold rotations that are not quite orthonormal, and their numbers depend on it.
+    greater than L. The error of the segment is (E_i^-1 E_j)^-1 (G_i^-1 G_j): its translation and its angle are divided by L.
+    Inverses are general and the angle is the arc cosine of the clamped trace, as in the devkit: published trajectories hold
+    rotations that are not quite orthonormal, and their numbers depend on it. Angles of single poses, which may be tiny, are those of
+    `registration.pose_errors`.
 
     Args:
         Ts_estimated: estimated sensor poses, in any fixed world frame.
-        Ts_true: true poses of the same sensor frame, row i beside row i.
+        Ts_true: true poses of the same sensor frame (`frames.compare_frames` tells), row i beside row i.
         lengths_m: segment lengths; the benchmark's by default, shorter ones for short tracks.
         step: a segment starts at every `step`-th frame.
 
     Returns:
-        Drift in percent and degrees per 100 m.
+        Errors in percent and degrees per 100 m, start by start.
 
     Raises:
         DeloError: wrong shape, unequal lengths, NaN or infinity, or a track shorter than the shortest segment.
@@ -68,18 +111,56 @@ def kitti_drift(
             f"got {np.sum(_steps(true)):.1f} m in {len(true)} poses; ask for shorter lengths"
         )
     translation_m, rotation_rad = _segment_errors(estimated, true, starts, ends)
-    t_rel = 100.0 * translation_m / lengths[which]
-    r_rel = 100.0 * np.rad2deg(rotation_rad) / lengths[which]
-    counts = np.bincount(which, minlength=lengths.size)
-    return Drift(
-        t_rel_percent=float(np.mean(t_rel)),
-        r_rel_deg_per_100m=float(np.mean(r_rel)),
-        num_segments=int(starts.size),
+    return Segments(
         lengths_m=lengths,
-        t_rel_percent_by_length=_means(t_rel, which, counts),
-        r_rel_deg_per_100m_by_length=_means(r_rel, which, counts),
+        which=which,
+        speed_mps=lengths[which] / (KITTI_FRAME_S * (ends - starts + 1)),
+        t_rel_percent=100.0 * translation_m / lengths[which],
+        r_rel_deg_per_100m=100.0 * np.rad2deg(rotation_rad) / lengths[which],
+    )
+
+
+def joined(sequences: Sequence[Segments]) -> Segments:
+    """The segments of several tracks as one: their mean is the benchmark's number of a method, where long tracks count for more.
+
+    Raises:
+        DeloError: none at all, or segments of different lengths.
+    """
+    if not sequences or any(not np.array_equal(segments.lengths_m, sequences[0].lengths_m) for segments in sequences):
+        raise DeloError(f"sequences: expected one or more with the same segment lengths, got {len(sequences)} that are not")
+    columns = zip(*(segments[1:] for segments in sequences), strict=True)
+    return Segments(sequences[0].lengths_m, *(np.concatenate(column) for column in columns))
+
+
+def mean_drift(segments: Segments) -> Drift:
+    """Mean over all segments with equal weight, as in the benchmark, and over those of each length."""
+    counts = np.bincount(segments.which, minlength=segments.lengths_m.size)
+    return Drift(
+        t_rel_percent=float(np.mean(segments.t_rel_percent)),
+        r_rel_deg_per_100m=float(np.mean(segments.r_rel_deg_per_100m)),
+        num_segments=int(segments.which.size),
+        lengths_m=segments.lengths_m,
+        t_rel_percent_by_length=_means(segments.t_rel_percent, segments.which, counts),
+        r_rel_deg_per_100m_by_length=_means(segments.r_rel_deg_per_100m, segments.which, counts),
         num_segments_by_length=counts,
     )
+
+
+def drift_by_speed(segments: Segments, *, speeds_mps: Sequence[float] = KITTI_SPEEDS_MPS) -> SpeedDrift:
+    """Mean over the segments within 2 m/s of each speed, as the benchmark plots it; the classes overlap.
+
+    Args:
+        segments: of one track or several.
+        speeds_mps: centres of the classes.
+    """
+    speeds = np.asarray(speeds_mps, dtype=np.float64)
+    belongs = np.abs(segments.speed_mps[:, None] - speeds) < _SPEED_REACH_MPS
+    counts = belongs.sum(axis=0)
+    t_rel, r_rel = (
+        np.where(counts > 0, values @ belongs / np.maximum(counts, 1), np.nan)
+        for values in (segments.t_rel_percent, segments.r_rel_deg_per_100m)
+    )
+    return SpeedDrift(speeds, t_rel, r_rel, counts)
 
 
 def _steps(Ts: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, " s"]:

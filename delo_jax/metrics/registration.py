@@ -23,6 +23,9 @@ class PoseErrors(NamedTuple):
 def pose_errors(Ts_estimated: Float[np.ndarray, "n 4 4"], Ts_true: Float[np.ndarray, "m 4 4"]) -> PoseErrors:
     """Errors of T_target_source (or any other T_a_b), pair by pair.
 
+    Angle and distance are the paper's registration errors (Eq. 12); its arc cosine of the trace loses small angles, so the angle is
+    an arc tangent here.
+
     The error is T_true^-1 T_estimated, the right perturbation in which covariances are given too; its translation is therefore
     expressed in the source frame b. Pass motions T_previous_current for components whose sign is that of the vehicle's motion.
 
