@@ -1,13 +1,13 @@
 """The noise of the truth of recorded drives: full-scan GICP started at the truth, minus the truth, per axis, drive and gap."""
 
-import functools
+from typing import NamedTuple
 
 import numpy as np
-import small_gicp
-from _peers import NUM_THREADS, Drive
+from _peers import Drive
 from _uncertainty import relative
 from rich.progress import Progress
 
+from delo_jax.baselines.gicp import Gicp
 from delo_jax.geometry import se3
 from delo_jax.geometry.deskew import deskew
 from delo_jax.pipeline.motion_model import NANOSECOND
@@ -36,20 +36,27 @@ def noise_header() -> str:
     return f"| drive | gap | pairs | {cells} | medians | standard deviations |\n|---|---:|---:|{'---:|' * 6}---|---|"
 
 
-def truth_noise(drive: Drive, gaps: tuple[int, ...], bar: Progress) -> dict[int, np.ndarray]:
-    """By gap, (6,) standard deviations of the truth of a pair; prints a row for each."""
-    prepare = functools.partial(small_gicp.preprocess_points, downsampling_resolution=0.25, num_threads=NUM_THREADS)
-    clouds = [prepare(points.astype(np.float64)) for points in bar.track(compensated(drive), description=f"{drive.name}: GICP's clouds")]
+class Noise(NamedTuple):
+    """Of the truth of a pair, (6,) each."""
+
+    robust: np.ndarray  # 1.4826 times the median distance from the median
+    deviation: np.ndarray  # standard deviation, which holds the tails: a heading that drifts
+
+
+def truth_noise(drive: Drive, gaps: tuple[int, ...], bar: Progress) -> dict[int, Noise]:
+    """By gap; prints a row for each."""
+    gicp = Gicp(gate_m=1.0)
+    clouds = [gicp.prepare(points) for points in bar.track(compensated(drive), description=f"{drive.name}: GICP's clouds")]
     found = {}
     for gap in gaps:
         errors = []
         for k in bar.track(range(len(clouds) - gap), description=f"{drive.name}: GICP at gap {gap}"):
-            T_true, (target, tree) = relative(drive.Ts_world_lidar, k, k + gap), clouds[k + gap]
-            result = small_gicp.align(target, clouds[k][0], tree, T_true, max_correspondence_distance=1.0, num_threads=NUM_THREADS)
-            errors.append(se3.log(se3.inverse(se3.orthonormal(np.asarray(result.T_target_source))) @ T_true))
+            T_true = relative(drive.Ts_world_lidar, k, k + gap)
+            T = gicp.align(clouds[k], clouds[k + gap], T_true).T_target_source
+            errors.append(se3.log(se3.inverse(se3.orthonormal(T)) @ T_true))
         middle = np.median(errors, axis=0)
-        found[gap] = 1.4826 * np.median(np.abs(np.array(errors) - middle[None]), axis=0)
-        cells = " | ".join(f"{value:.2f}" for value in PRINTED * found[gap])
-        rest = (", ".join(f"{value:.2f}" for value in PRINTED * numbers) for numbers in (middle, np.std(errors, axis=0)))
+        noise = found[gap] = Noise(1.4826 * np.median(np.abs(np.array(errors) - middle[None]), axis=0), np.std(errors, axis=0))
+        cells = " | ".join(f"{value:.2f}" for value in PRINTED * noise.robust)
+        rest = (", ".join(f"{value:.2f}" for value in PRINTED * numbers) for numbers in (middle, noise.deviation))
         print(f"| {drive.name} | {gap} | {len(errors)} | {cells} | {' | '.join(rest)} |", flush=True)
     return found

@@ -221,7 +221,7 @@ def main(argv: list[str] | None = None) -> int:
         for name in args.drives:
             drive = recorded(args.data, name, num_scans if args.quick else None, bar)
             print(f"\n{noise_header()}")
-            noise = truth_noise(drive, (1,), bar)[1]
+            noise = truth_noise(drive, (1,), bar)[1].robust
             show_drives(f"{name}, pair after pair", model, in_a_row(model, [drive], bar), found, noise)
     draw(args.out, unseen, said[FULL])
     rows = judge(unseen, said[FULL].covariances)

@@ -81,3 +81,12 @@ def _reweighted(source, matched, weights, mask, cfg):
 
     start = planar_procrustes(source, matched, weights), jnp.zeros((), jnp.int32)
     return jax.lax.fori_loop(0, cfg.num_rounds, reweight, start)
+
+
+def point_information(points: Float[Array, "n 3"], weights: Float[Array, " n"]) -> Float[Array, "6 6"]:
+    """Gauss-Newton matrix of the distances between matched points, for a right perturbation; zero without weight."""
+    total = jnp.sum(weights)
+    share = weights / jnp.where(total > 0, total, 1.0)
+    eye = jnp.broadcast_to(jnp.eye(3), (points.shape[0], 3, 3))
+    jacobian = jnp.concatenate([-se3.skew(points), eye], axis=-1)  # of R^T d(T x) by [omega, v]
+    return jnp.einsum("n,nki,nkj->ij", share, jacobian, jacobian)

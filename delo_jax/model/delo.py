@@ -11,11 +11,10 @@ from jaxtyping import Array, Bool, Float, Key
 
 from delo_jax.config import DeloConfig
 from delo_jax.geometry import se3
-from delo_jax.geometry.point_to_plane import point_to_plane_step
 from delo_jax.geometry.se3 import AnyArray, full_float32
 from delo_jax.model import fine
 from delo_jax.model.attention import CloudContext
-from delo_jax.model.coarse import CoarsePose, coarse_pose
+from delo_jax.model.coarse import CoarsePose, coarse_pose, point_information
 from delo_jax.model.network import Network, example_inputs
 from delo_jax.model.statistics import NUM_STATISTICS, consensus, statistics
 from delo_jax.ops import evidence, spread
@@ -240,7 +239,7 @@ def solve(model: Applicable, source: Encoding, target: Encoding, T_init: Float[A
     T_delta, information = fine.step(matches, cfg=cfg)
     disagreement = se3.inverse(refined[1 - best]) @ refined[best]
     stats = statistics(matches, information, T, T_delta, disagreement, first.inlier_share, scores[1 - best])
-    planes = _plane_information(matches, T)
+    planes = fine.plane_information(matches, T)
     finite = jnp.all(jnp.isfinite(T)) & jnp.all(jnp.isfinite(stats)) & jnp.all(jnp.isfinite(planes))
     nig, confidence = predict_evidence(model, source, target, matching, T, stats)
     return Registration(T, planes, nig, confidence, stats, best == 1, finite)
@@ -249,7 +248,7 @@ def solve(model: Applicable, source: Encoding, target: Encoding, T_init: Float[A
 def _unrefined(model, source, target, matching, first):
     """The coarse pose as the answer."""
     T = first.T_target_source
-    information = _point_information(source.keypoints, first.weights)
+    information = point_information(source.keypoints, first.weights)
     finite = jnp.all(jnp.isfinite(T)) & first.determined
     nig, confidence = predict_evidence(model, source, target, matching, T, jnp.zeros(0))
     return Registration(T, information, nig, confidence, jnp.zeros(0), jnp.ones((), bool), finite)
@@ -306,19 +305,3 @@ def evidence_units(cfg: DeloConfig) -> Float[Array, "6"]:
 
 def _first(cloud: fine.Cloud, num: int) -> fine.Cloud:
     return jax.tree.map(lambda array: array[:num], cloud)
-
-
-def _plane_information(matches: fine.Matches, T: Float[Array, "4 4"]) -> Float[Array, "6 6"]:
-    """Gauss-Newton matrix of the plane distances alone, carried from the left twist to the right perturbation of T."""
-    step = point_to_plane_step(*matches[:3], matches.weights, jnp.zeros_like(matches.weights), damping=0.0)
-    Ad = se3.adjoint(T)
-    return Ad.T @ step.information @ Ad / (jnp.sum(matches.weights) + 1e-6)
-
-
-def _point_information(points: Float[Array, "n 3"], weights: Float[Array, " n"]) -> Float[Array, "6 6"]:
-    """Gauss-Newton matrix of the distances between matched points, for a right perturbation; zero without weight."""
-    total = jnp.sum(weights)
-    share = weights / jnp.where(total > 0, total, 1.0)
-    eye = jnp.broadcast_to(jnp.eye(3), (points.shape[0], 3, 3))
-    jacobian = jnp.concatenate([-se3.skew(points), eye], axis=-1)  # of R^T d(T x) by [omega, v]
-    return jnp.einsum("n,nki,nkj->ij", share, jacobian, jacobian)

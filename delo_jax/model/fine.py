@@ -147,3 +147,10 @@ def refine(
         return T_next, T_next
 
     return jax.lax.scan(iterate, T_init, length=num_iters)[1]
+
+
+def plane_information(matches: Matches, T: Float[Array, "4 4"]) -> Float[Array, "6 6"]:
+    """Gauss-Newton matrix of the plane distances alone, carried from the left twist to the right perturbation of T."""
+    step = point_to_plane_step(*matches[:3], matches.weights, jnp.zeros_like(matches.weights), damping=0.0)
+    Ad = se3.adjoint(T)
+    return Ad.T @ step.information @ Ad / (jnp.sum(matches.weights) + 1e-6)
