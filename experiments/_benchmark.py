@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from _peers import Sweep, recorded
+from _routes import official
 from rich.progress import Progress
 
 import delo_jax
@@ -20,8 +21,7 @@ from delo_jax.sim import simulate_route
 from delo_jax.train.worlds import SIMULATOR, write_arrays
 
 GAPS = (1, 2, 3, 5)
-NUM_PAIRS, NUM_SLOW_PAIRS = 100, 60  # of a sequence and gap, at even distances
-SLOW_S, NUM_TRIED = 0.2, 5  # a method whose first pairs take longer than this gets the smaller number
+NUM_PAIRS = 60  # of a sequence and gap, at even distances
 ROUTE_SEED = 770_000  # of the world of sequence 00
 KINDS = {  # of the worlds beside KITTI's routes
     "00": "residential",
@@ -104,17 +104,9 @@ def source_hash(parts: tuple[str, ...]) -> str:
     return digest.hexdigest()[:16]
 
 
-def route(data: Path, number: str) -> np.ndarray:
-    """LiDAR poses of an official sequence, x forward, the first one level."""
-    with np.load(data / "kitti_poses.npz") as poses, np.load(data / "kitti_calib_tr.npz") as calibrations:
-        rows, T_cam_lidar = poses[number], np.vstack([calibrations[number], [0.0, 0.0, 0.0, 1.0]])
-    Ts = np.concatenate([rows, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(rows), 1, 1))], axis=1)
-    return se3.inverse(T_cam_lidar) @ Ts @ T_cam_lidar
-
-
 def simulated(data: Path, number: str, *, num_scans: int | None) -> Sequence:
     """A drive along an official sequence, as measured by a turning sensor; whole, or its first frames."""
-    Ts = route(data, number)[:num_scans]
+    Ts = se3.orthonormal(official(data, number))[:num_scans]
     kind, seed = KINDS[number], ROUTE_SEED + int(number)
     key = _digest([SIMULATOR, source_hash(RENDERING), kind, seed, hashlib.sha256(Ts.tobytes()).hexdigest()])
 
@@ -164,22 +156,15 @@ class _Taken:
             self._prepared[number] = ready, time.perf_counter() - begin
         return self._prepared[number]
 
-    @property
-    def slow(self) -> bool:
-        """Whether it gets fewer pairs."""
-        first = list(self.seconds.values())[1 : 1 + NUM_TRIED]  # the very first one may compile
-        return len(first) == NUM_TRIED and float(np.median(first)) > SLOW_S
-
-    def result(self, few: set[tuple[int, int]]) -> Pairs:
-        """All of them, or those that a slow method takes."""
-        keys = [key for key in self.errors if not self.slow or key in few]
-        errors, seconds = (np.array([values[key] for key in keys]) for values in (self.errors, self.seconds))
-        return Pairs(errors.reshape(-1, 6), np.array([gap for gap, _ in keys]), seconds)
+    def result(self) -> Pairs:
+        """All of them."""
+        errors, seconds = (np.array(list(values.values())) for values in (self.errors, self.seconds))
+        return Pairs(errors.reshape(-1, 6), np.array([gap for gap, _ in self.errors]), seconds)
 
 
-def chosen(num_scans: int, count: int) -> set[tuple[int, int]]:
-    """(gap, source) of that many pairs of each gap, at even distances."""
-    return {(gap, int(k)) for gap in GAPS for k in np.unique(np.linspace(0, num_scans - gap - 1, count).astype(int)) if num_scans > gap}
+def chosen(num_scans: int) -> set[tuple[int, int]]:
+    """(gap, source) of the pairs."""
+    return {(gap, int(k)) for gap in GAPS if num_scans > gap for k in np.unique(np.linspace(0, num_scans - gap - 1, NUM_PAIRS).astype(int))}
 
 
 def run(sequence: Sequence, entries: dict[str, Entry], store: Path, bar: Progress) -> Results:
@@ -194,7 +179,7 @@ def run(sequence: Sequence, entries: dict[str, Entry], store: Path, bar: Progres
     store.mkdir(parents=True, exist_ok=True)
 
     def place(what: str, name: str = "", version: str = "") -> Path:
-        return store / f"{_digest([sequence.key, what, name, version, GAPS, NUM_PAIRS, NUM_SLOW_PAIRS, SLOW_S])}.npz"
+        return store / f"{_digest([sequence.key, what, name, version, GAPS, NUM_PAIRS])}.npz"
 
     poses = {name: place("poses", name, entry.version) for name, entry in entries.items() if entry.odometry is not None}
     pairs = {name: place("pairs", name, entry.version) for name, entry in entries.items() if entry.pair is not None}
@@ -220,7 +205,7 @@ def _one_pass(sequence: Sequence, entries: dict[str, Entry], new_poses: list[str
     running = [(name, start()) for name in new_poses if (start := entries[name].odometry) is not None]
     taken = {name: _Taken(make()) for name in new_pairs if (make := entries[name].pair) is not None}
     rows: dict[str, list[tuple[np.ndarray, float, bool]]] = {name: [] for name in new_poses}
-    many, few = (chosen(sequence.num_scans, count) for count in (NUM_PAIRS, NUM_SLOW_PAIRS))
+    wanted = chosen(sequence.num_scans)
     truth: list[np.ndarray] = []
     scans: dict[int, np.ndarray] = {}
     for k, (sweep, T) in enumerate(bar.track(sequence.scans(), total=sequence.num_scans, description=sequence.name)):
@@ -231,9 +216,8 @@ def _one_pass(sequence: Sequence, entries: dict[str, Entry], new_poses: list[str
             begin = time.perf_counter()
             frame = odometry.register(sweep.points, sweep.stamp_ns, sweep.times_s)
             rows[name].append((np.array(frame.T_world_lidar), time.perf_counter() - begin, frame.status == "ok"))
-        for gap in (gap for gap in GAPS if gap <= k):
+        for gap in (gap for gap in GAPS if (gap, k - gap) in wanted):
             for one in taken.values():
-                if (gap, k - gap) in (few if one.slow else many | few):
-                    one.solve(gap, k - gap, scans, se3.inverse(T) @ truth[k - gap])
+                one.solve(gap, k - gap, scans, se3.inverse(T) @ truth[k - gap])
     poses = {name: Poses(*(np.array(column) for column in zip(*found, strict=True))) for name, found in rows.items()}
-    return Results(np.stack(truth), poses, {name: one.result(few) for name, one in taken.items()})
+    return Results(np.stack(truth), poses, {name: one.result() for name, one in taken.items()})

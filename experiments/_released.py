@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from _routes import calibration, official, whole
 
 from delo_jax.data import camera_to_lidar, lidar_to_camera
 from delo_jax.errors import DatasetError
@@ -36,33 +37,23 @@ class Tree:
     """Official poses and released trajectories of the data tree."""
 
     def __init__(self, folder: Path):
-        self._folder = folder / "released_trajectories"
-        files = folder / "kitti_poses.npz", folder / "kitti_calib_tr.npz", self._folder / "golden_metrics.json"
-        missing = [str(path) for path in files if not path.exists()]
-        if missing:
-            raise DatasetError(f"{folder}: expected official poses and released trajectories, got no {', '.join(missing)}; check --data")
-        self._poses, self._calibrations = np.load(files[0]), np.load(files[1])
-        self.golden = json.loads(files[2].read_text())["methods"]
+        self._data, self._folder = folder, folder / "released_trajectories"
+        golden = self._folder / "golden_metrics.json"
+        if not golden.exists():
+            raise DatasetError(f"{folder}: expected released trajectories, got no {golden}; check --data")
+        self.golden = json.loads(golden.read_text())["methods"]
 
     def truth(self, sequence: str, frame: str) -> np.ndarray:
         """Official poses in the frame of the LiDAR or of the camera."""
-        Ts = _whole(self._poses[sequence])
-        return Ts if frame == "camera" else camera_to_lidar(Ts, _whole(self._calibrations[sequence]))
+        return official(self._data, sequence, frame)
 
     def released(self, method: str, sequence: str, frame: str) -> np.ndarray:
         """Poses that were released, brought to a frame."""
         with np.load(self._folder / f"{method}.npz") as file:
-            Ts = _whole(file[sequence])
+            Ts = whole(file[sequence])
         own = "camera" if method == "simple_online" else "lidar"
         to_frame = lidar_to_camera if frame == "camera" else camera_to_lidar
-        return Ts if frame == own else to_frame(Ts, _whole(self._calibrations[sequence]))
-
-
-def _whole(rows: np.ndarray) -> np.ndarray:
-    """(..., 4, 4) of (..., 3, 4)."""
-    Ts = np.zeros((*rows.shape[:-2], 4, 4))
-    Ts[..., :3, :], Ts[..., 3, 3] = rows, 1.0
-    return Ts
+        return Ts if frame == own else to_frame(Ts, calibration(self._data, sequence))
 
 
 def number(Ts_estimated: np.ndarray, Ts_true: np.ndarray) -> Number:

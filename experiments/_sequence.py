@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from _routes import official
 from rich.progress import Progress
 
 import delo_jax
 from delo_jax import inference
-from delo_jax.data import camera_to_lidar
 from delo_jax.data.fields import FRAME_PERIOD_NS
-from delo_jax.errors import ConfigError, DatasetError
+from delo_jax.errors import ConfigError
 from delo_jax.geometry import se3
 from delo_jax.inference import Estimate, PreparedScan
 from delo_jax.model.delo import Model
@@ -22,7 +22,6 @@ from delo_jax.refine.refiner import Record, Refiner, Tracked
 from delo_jax.sim import simulate_route
 from delo_jax.uncertainty.gate import Verdict
 
-FILES = ("kitti_poses.npz", "kitti_calib_tr.npz")
 SMALLEST_NUM_FRAMES = 10
 
 
@@ -72,21 +71,12 @@ def official_poses(data: Path, sequence: str, frames: tuple[int, int]) -> np.nda
         DatasetError: no such poses in the data tree.
         ConfigError: frames that the sequence does not have, or too few.
     """
-    missing = [name for name in FILES if not (data / name).exists()]
-    if missing:
-        raise DatasetError(f"{data}: expected {' and '.join(FILES)}, got no {missing[0]}; check --data")
-    with np.load(data / FILES[0]) as poses, np.load(data / FILES[1]) as calibrations:
-        if sequence not in poses.files:
-            raise ConfigError(f"--sequence: expected one of {', '.join(poses.files)}, got {sequence}")
-        top, Tr = np.asarray(poses[sequence], np.float64), np.asarray(calibrations[sequence], np.float64)
+    Ts = official(data, sequence)
     first, last = frames
-    if first < 0 or not first + SMALLEST_NUM_FRAMES <= last <= len(top):
-        what = f"two numbers of 0 to {len(top)}, {SMALLEST_NUM_FRAMES} or more apart"
+    if first < 0 or not first + SMALLEST_NUM_FRAMES <= last <= len(Ts):
+        what = f"two numbers of 0 to {len(Ts)}, {SMALLEST_NUM_FRAMES} or more apart"
         raise ConfigError(f"--frames: expected {what}, for sequence {sequence}, got {first} {last}")
-    bottom = np.array([[0.0, 0.0, 0.0, 1.0]])
-    Ts = np.concatenate([top, np.broadcast_to(bottom[None], (len(top), 1, 4))], axis=1)[first:last]
-    T_cam_lidar = se3.orthonormal(np.concatenate([Tr, bottom]))
-    return camera_to_lidar(se3.orthonormal(Ts), T_cam_lidar)
+    return se3.orthonormal(Ts[first:last])
 
 
 def follow(Ts_route: np.ndarray, kind: str, seed: int, params: Model, bar: Progress, title: str) -> Followed:

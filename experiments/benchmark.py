@@ -5,8 +5,8 @@ path, with exact truth (no scan of KITTI is in them; `delo_jax.sim.simulate_rout
 others; `--all` takes 00 to 10 whole. Recorded sequences with `poses_boresight` as truth. KITTI's metric over the lengths of 100 to 800 m
 that each reaches, 10 to 50 m on the recorded ones; two threads; every method sees every scan as it comes, taking turns at who is first.
 
-Pairs at gaps of 1, 2, 3 and 5 frames, from the identity, as measured (no de-skew), 100 at even distances of each gap, 60 where a method
-takes more than 0.2 s; a pair is lost when it is off by more than 0.5 m or 2 deg. Times hold the preparation of both scans.
+Pairs at gaps of 1, 2, 3 and 5 frames, from the identity, as measured (no de-skew), 60 at even distances of each gap; a pair is lost when it
+is off by more than 0.5 m or 2 deg. Times hold the preparation of both scans.
 
 What a method made of a sequence is kept in `--out` by content (scans, method, version, settings): a re-run does what has changed.
 

@@ -11,7 +11,7 @@ VGICP: small_gicp on points of 0.5 m and voxels of 1 m of the same scans. Classi
 step, at the gate of the pipeline and behind rounds on fewer points whose gate closes from 15 m. Times are those of the search;
 preparing a scan is apart, for all alike.
 
-Run:     python experiments/map_basin.py --data TREE       (about 5 minutes on 2 cores; needs small_gicp)
+Run:     python experiments/map_basin.py --data TREE       (about 5 minutes on 2 cores; needs '.[baselines]')
 Expect:  all bounds kept.
 """
 
@@ -24,12 +24,13 @@ import jax
 import numpy as np
 import small_gicp
 from _harness import Row
-from _peers import NUM_THREADS, Drive, Sweep, recorded
+from _peers import Drive, Sweep, recorded
 from rich.progress import Progress
 from running_odometry import DRIVES
 
 import delo_jax
 from delo_jax import inference
+from delo_jax.baselines.protocols import NUM_THREADS
 from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.geometry import se3
 from delo_jax.metrics.registration import pose_errors

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import _harness
 import numpy as np
 from _harness import Row
+from _routes import SEQUENCES, official
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
@@ -225,14 +226,11 @@ def main(argv: list[str] | None = None) -> int:
     rng = np.random.default_rng(0)
     repeats, sizes, num_long = (5, (30,), 500) if args.quick else (NUM_REPEATS, (30, 100, 300), 4503)
     rows = show_gains("Simulated bends", gains([bends(NUM_POSES, rng) for _ in range(repeats)], seed=1))
-    with np.load(args.data / "kitti_poses.npz") as official:
-        names = official.files[:2] if args.quick else official.files
-        tops = {name: np.asarray(official[name], np.float64) for name in names}
-    bottom = np.array([[[0.0, 0.0, 0.0, 1.0]]])
-    drives = [se3.orthonormal(np.concatenate([top, np.repeat(bottom, len(top), 0)], axis=1)) for top in tops.values()]
+    names = SEQUENCES[:2] if args.quick else SEQUENCES
+    drives = [se3.orthonormal(official(args.data, name, "camera")) for name in names]
     rows += show_gains("KITTI's official motions", gains(drives, seed=2))
     rows += agreement(sizes) + wrong_loops() + times(num_long)
-    return _harness.finish(rows, {"repeats": repeats, "sequences": list(tops), "sigmas": SIGMAS.tolist()}, args)
+    return _harness.finish(rows, {"repeats": repeats, "sequences": list(names), "sigmas": SIGMAS.tolist()}, args)
 
 
 if __name__ == "__main__":

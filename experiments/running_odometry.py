@@ -9,26 +9,28 @@ The drives were chosen by their motion alone: of each kind the first seed, from 
 is 115 to 170 m long, so that every third scan is 3 to 4 m on, and whose body swings as those of KITTI do: the median change of
 pitch and roll rate from scan to scan lies within 0.075 to 0.15 deg per scan, as in the eleven official sequences (0.076 to 0.149).
 The rough drives, printed without a bound, are the first of each kind of that length whatever their swing, from 500,000, 500,100,
-500,200 and 500,300 on. Training uses seeds below 1,000 and from 1,000,000 on. Settings of the peers: see `_peers.py`.
+500,200 and 500,300 on. Training uses seeds below 1,000 and from 1,000,000 on. Settings of the peers: see `delo_jax/baselines/`.
 
-Run:     python experiments/running_odometry.py --data TREE       (about 20 minutes on 2 cores; needs kiss-icp and small_gicp)
+Run:     python experiments/running_odometry.py --data TREE       (about 20 minutes on 2 cores; needs '.[baselines]')
 Expect:  all bounds kept; the timing bounds want an otherwise idle machine.
 """
 
 import os
 import time
-from typing import Any
 
 import _harness
 import numpy as np
 from _harness import Row
-from _peers import NUM_THREADS, Drive, Gicp, Kiss, Odometry, Sweep, Vgicp, recorded, simulated
+from _peers import Drive, recorded, simulated
 from _tracks import GAP, Table, Track, mean, numbers, show, show_thinned, swing_deg
 from rich.progress import Progress
 
 import delo_jax
+from delo_jax.baselines.protocols import NUM_THREADS
+from delo_jax.baselines.registry import METHODS
 from delo_jax.inference import Estimate, PreparedScan
 from delo_jax.model.delo import Model
+from delo_jax.pipeline.baseline_odometry import BaselineOdometry
 from delo_jax.pipeline.scan_to_map import Steps
 from delo_jax.uncertainty import covariance
 
@@ -62,35 +64,27 @@ def no_network(params: Model, source: PreparedScan, target: PreparedScan, T_targ
     return Estimate(T_target_source=T_target_source_init, **known._asdict(), status="rejected", confidence=0.0, reason="no network")
 
 
-class Ours:
-    """`LidarOdometry` as one of many."""
+Odometry = delo_jax.LidarOdometry | BaselineOdometry
 
-    def __init__(self, params: Model, **options: Any):
-        self._odometry = delo_jax.LidarOdometry(params, **options)
 
-    def register(self, sweep: Sweep) -> np.ndarray:
-        """T_world_lidar at the stamp."""
-        return self._odometry.register(sweep.points, sweep.stamp_ns, sweep.times_s).T_world_lidar
-
-    @property
-    def ok(self) -> float:
-        """Share of the frames with this status."""
-        return float(np.mean([status == "ok" for status in self._odometry.trajectory().statuses]))
+def peer(name: str, *, deskew: bool = True) -> BaselineOdometry:
+    """Another method, fresh."""
+    return BaselineOdometry(METHODS[name].open_tracker(), deskew=deskew)
 
 
 def methods(params: Model, *, skewed: bool) -> dict[str, Odometry]:
     """Fresh odometries; where nothing is to be de-skewed, those that differ in it alone are left out."""
     found: dict[str, Odometry] = {
-        OURS: Ours(params),
-        CLASSICAL: Ours(params, steps=Steps(num_learned=0, num_rounds=3)),
-        ALONE: Ours(params, steps=Steps(num_learned=0, num_rounds=3), align=no_network),
-        "ours, no classical end": Ours(params, steps=Steps(num_learned=6, num_rounds=0)),
-        ONE_PASS: Ours(params, steps=Steps(deskew_again=False)),
-        "ours, scan to scan": Ours(params, use_map=False),
-        KISS: Kiss(),
-        KISS_STILL: Kiss(deskew=False),
-        VGICP: Vgicp(),
-        GICP: Gicp(),
+        OURS: delo_jax.LidarOdometry(params),
+        CLASSICAL: delo_jax.LidarOdometry(params, steps=Steps(num_learned=0, num_rounds=3)),
+        ALONE: delo_jax.LidarOdometry(params, steps=Steps(num_learned=0, num_rounds=3), align=no_network),
+        "ours, no classical end": delo_jax.LidarOdometry(params, steps=Steps(num_learned=6, num_rounds=0)),
+        ONE_PASS: delo_jax.LidarOdometry(params, steps=Steps(deskew_again=False)),
+        "ours, scan to scan": delo_jax.LidarOdometry(params, use_map=False),
+        KISS: peer("kiss-icp"),
+        KISS_STILL: peer("kiss-icp", deskew=False),
+        VGICP: peer("vgicp"),
+        GICP: peer("gicp"),
     }
     return found if skewed else {name: odometry for name, odometry in found.items() if name not in (ONE_PASS, KISS_STILL)}
 
@@ -101,17 +95,20 @@ def follow(drive: Drive, params: Model, bar: Progress) -> dict[str, Track]:
     poses: dict[str, list[np.ndarray]] = {name: [] for name, _ in odometries}
     seconds: dict[str, list[float]] = {name: [] for name, _ in odometries}
     for k, sweep in enumerate(bar.track(drive.sweeps, description=f"{drive.name}, {len(drive.sweeps)} scans")):
-        wide, first = sweep._replace(points=sweep.points.astype(np.float64)), k % len(odometries)
+        first = k % len(odometries)
         for name, odometry in odometries[first:] + odometries[:first]:
-            scan = wide if name in PEERS else sweep
             begin = time.perf_counter()
-            T_world_lidar = odometry.register(scan)
+            frame = odometry.register(sweep.points, sweep.stamp_ns, sweep.times_s)
             seconds[name].append(time.perf_counter() - begin)
-            poses[name].append(np.array(T_world_lidar))
-    return {
-        name: Track(np.array(poses[name]), np.array(seconds[name]), odometry.ok if isinstance(odometry, Ours) else np.nan)
-        for name, odometry in odometries
-    }
+            poses[name].append(frame.T_world_lidar)
+    return {name: Track(np.array(poses[name]), np.array(seconds[name]), share_ok(odometry)) for name, odometry in odometries}
+
+
+def share_ok(odometry: Odometry) -> float:
+    """Share of the frames that are `ok`; NaN for a method that does not say."""
+    if isinstance(odometry, BaselineOdometry):
+        return np.nan
+    return float(np.mean([status == "ok" for status in odometry.trajectory().statuses]))
 
 
 def measure(drive: Drive, params: Model, bar: Progress) -> tuple[Table, Table]:

@@ -85,7 +85,7 @@ def _works(name: str) -> Iterator[Check]:
     import numpy as np
 
     import delo_jax
-    from delo_jax.cli.tracking import compile_model
+    from delo_jax.cli.method import compile_model
     from delo_jax.metrics.registration import pose_errors
     from delo_jax.sim import simulate_drive
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from delo_jax.model.delo import Model
     from delo_jax.refine.plan import Factors
     from delo_jax.refine.refiner import Record
+    from delo_jax.report.cloud import DriveCloud
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,13 +41,18 @@ class Refine(Command):
     """gtsam: sparse, any length; jax: matrix-free by optimistix, up to 1,000 frames."""
 
     def run(self) -> int:
-        """Registers pairs, solves, writes refined.tum, refined_kitti.txt and refined_covariances.npy, and prints what was gained."""
+        """Registers pairs, solves, writes the refined poses and their covariances, report.html anew, and prints what was gained."""
         from delo_jax.cli.console import print_summary
+        from delo_jax.cli.page import write_page
         from delo_jax.cli.refinement import FILES, refine, write
         from delo_jax.cli.summary import refinement_rows
         from delo_jax.refine.jax_backend import check_length
+        from delo_jax.report.cloud import DriveCloud
 
         facts, options = facts_of(self.folder), options_of(self.folder)
+        if facts.get("method", "delo") != "delo":
+            why = "whose covariances say what a motion counts"
+            raise DatasetError(f"{self.folder}: expected a run of --method delo, {why}, got one of {facts['method']}; run again with delo")
         frames = frames_of(self.folder, facts)
         if len(frames.Ts_world_lidar) < 2:
             raise DatasetError(f"{self.folder}: expected a run of two or more frames, got {len(frames.Ts_world_lidar)}; nothing to refine")
@@ -56,7 +62,8 @@ class Refine(Command):
         if len(scans.dataset) < len(frames.stamps_ns):
             what = f"expected the {len(frames.stamps_ns)} scans of the run, got {len(scans.dataset)}"
             raise DatasetError(f"{scans.dataset.name}: {what}; give their folder by --data")
-        record, Ts_online = _passes(scans, self.graph)
+        cloud = DriveCloud()
+        record, Ts_online = _passes(scans, self.graph, cloud)
         loops = None if self.no_loops else _loops(scans, record)
         found = refine(record, Ts_online, loops=loops, backend=self.backend)
         T_cam_lidar = facts.get("T_cam_lidar")
@@ -64,8 +71,9 @@ class Refine(Command):
         truth = scans.dataset.truth
         if truth is not None:
             truth = truth[: len(frames.stamps_ns)]
+        page = write_page(self.folder, cloud, truth=truth, refinement=found, loops=None if loops is None else len(loops.sources))
         print_summary(refinement_rows(found, frames.Ts_world_lidar, truth), "pose graph")
-        print(f"{', '.join(FILES)}: {self.folder}")
+        print(f"{', '.join([*FILES, page.name])}: {self.folder}")
         return 0
 
     def _open(self, facts: dict[str, Any], options: dict[str, Any]) -> "Dataset":
@@ -125,7 +133,7 @@ class Scans:
         return se3.log(se3.inverse(Ts[start]) @ Ts[end]) / (1e-9 * (stamps_ns[end] - stamps_ns[start]))
 
 
-def _passes(scans: Scans, cfg: RefineConfig) -> "tuple[Record, np.ndarray]":
+def _passes(scans: Scans, cfg: RefineConfig, cloud: "DriveCloud") -> "tuple[Record, np.ndarray]":
     """What the network says of frames that are a few apart, and the smoothed poses."""
     from delo_jax.cli.console import progress
     from delo_jax.refine.refiner import Refiner, Tracked
@@ -135,7 +143,10 @@ def _passes(scans: Scans, cfg: RefineConfig) -> "tuple[Record, np.ndarray]":
     with progress() as bar, Refiner(scans.params, cfg) as refiner:
         task = bar.add_task("registering pairs", total=len(frames.since), note="")
         for number, (since, T, covariance, local) in enumerate(rows):
-            refiner.add(Tracked(int(since), T, covariance, local, scans.prepared(number)))
+            prepared = scans.prepared(number)
+            refiner.add(Tracked(int(since), T, covariance, local, prepared))
+            if prepared is not None:
+                cloud.add_scan(number, T, prepared)
             bar.advance(task)
     return refiner.record, refiner.Ts_world_lidar
 

@@ -18,6 +18,22 @@ DESKEW_WORDS = {
     "azimuth": "done, with times by azimuth",
     "none": "none: the points carry no times",
 }
+Method = Literal[
+    "delo",
+    "kiss-icp",
+    "genz-icp",
+    "vgicp",
+    "gicp",
+    "icp",
+    "point-to-plane",
+    "kiss-matcher",
+    "delo-paper",
+    "dcp",
+    "constant-velocity",
+    "mean-motion",
+    "identity",
+]
+"""Those of `baselines.registry`, which is not imported before it is needed."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,10 +49,14 @@ class Run(Command):
     """Which sequence or drive, where the path holds several."""
     out: Path | None = None
     """Folder for the results; runs/NAME, numbered, by default."""
-    weights: str = "delo-base"
-    """Released weights by name, or a .safetensors file."""
-    map: Literal["local", "none"] = "local"
-    """local: scans are registered to a map of what was seen lately; none: to the last scan, by the network alone."""
+    method: Method = "delo"
+    """delo: this package. Whole odometries of other packages: kiss-icp, genz-icp; vgicp, on a map of voxels. Scan to scan: gicp, icp,
+    point-to-plane, kiss-matcher; delo-paper and dcp with weights that you have trained. Without measuring: constant-velocity (the first
+    motion, by GICP, for ever), mean-motion (10.5 m/s straight ahead), identity. Only delo and delo-paper know their uncertainty."""
+    weights: str | None = None
+    """Released weights by name, or a .safetensors file; delo-base by default."""
+    map: Literal["local", "none"] | None = None
+    """local, the default: scans are registered to a map of what was seen lately; none: to the last scan, by the network alone."""
     deskew: Literal["auto", "on", "off"] = "auto"
     """Undo the motion within a sweep. auto: where points carry times; on: also by azimuth, for scans as measured."""
     refine: bool = False
@@ -46,11 +66,19 @@ class Run(Command):
     no_elevation_correction: bool = False
     """Leave out the 0.205 deg that KITTI's scans need; other scans are never changed."""
 
+    def effective(self) -> "Run":
+        """With the defaults of the method filled in."""
+        return self if self.method != "delo" else dataclasses.replace(self, weights=self.weights or "delo-base", map=self.map or "local")
+
     def run(self) -> int:
         """Tracks all scans and prints a summary."""
+        from delo_jax.baselines.registry import METHODS
+        from delo_jax.cli.method import check_options
         from delo_jax.cli.tracking import Job, new_folder, track
         from delo_jax.data.dataset import open_dataset
 
+        check_options(METHODS[self.method], given_weights=self.weights, given_map=self.map, refine=self.refine)
+        options = self.effective()
         dataset = open_dataset(
             self.path, sequence=self.sequence, elevation_correction=not self.no_elevation_correction, azimuth_times=self.deskew == "on"
         )
@@ -58,16 +86,17 @@ class Run(Command):
         deskew = "off" if self.deskew == "off" else DESKEW_WORDS[dataset.point_times]
         print("\n".join([*dataset.describe(), f"de-skew: {deskew}"]))
         job = Job(
-            command=dataclasses.replace(self, out=folder),
+            command=dataclasses.replace(options, out=folder),
             source=dataset,
             folder=folder,
-            weights=self.weights,
-            use_map=self.map == "local",
+            method=self.method,
+            weights=options.weights,
+            use_map=options.map == "local",
             deskew=self.deskew != "off",
             refine=self.refine,
             stamp_sigma_s=1e-3 * self.stamp_sigma_ms,
             stage="read",
-            facts=self._facts(dataset, deskew),
+            facts=options._facts(dataset, deskew),
         )
         return conclude(job, track(job))
 
@@ -88,6 +117,7 @@ class Run(Command):
 def conclude(job: "Job", result: "Result") -> int:
     """Prints the end of a run and returns its exit code."""
     from delo_jax.cli.console import print_summary
+    from delo_jax.cli.page import write_page
     from delo_jax.cli.summary import refinement_rows, rejected_lines, run_rows
 
     trajectory, total = result.trajectory, len(job.source)
@@ -95,6 +125,7 @@ def conclude(job: "Job", result: "Result") -> int:
     for line in lines:
         print(f"rejected: {line}")
     if len(trajectory):
+        write_page(job.folder, result.cloud, truth=result.truth, refinement=result.refinement)
         print_summary(run_rows(result))
     if result.refinement is not None:
         print_summary(refinement_rows(result.refinement, trajectory.Ts_world_lidar, result.truth), "pose graph")
@@ -106,5 +137,5 @@ def conclude(job: "Job", result: "Result") -> int:
         remedy = "check that the scans hold x, y, z in metres, seen from the sensor"
         print(f"delo: {job.source.name}: no usable scan among {total}, the first: {lines[0]}; {remedy}", file=sys.stderr)
         return 1
-    print(f"poses in the {'lidar' if job.source.T_cam_lidar is None else 'camera'} frame, picture, frames: {job.folder}")
+    print(f"poses in the {'lidar' if job.source.T_cam_lidar is None else 'camera'} frame, report.html, frames: {job.folder}")
     return 0

@@ -22,7 +22,10 @@ def run_rows(result: Result) -> list[Row]:
     rows += timing_rows({name: seconds for name, seconds in result.timing.items() if name != "simulate"})  # no part of odometry
     if simulating := percentiles_ms(result.timing.get("simulate", np.zeros(0))):
         rows.append(Row("simulating (apart), p50 / p95", f"{simulating[0]:.0f} / {simulating[1]:.0f}", "ms"))
-    rows.append(Row("compiling (apart)", f"{result.compile_s:.1f}", "s"))
+    if result.compile_s:
+        rows.append(Row("compiling (apart)", f"{result.compile_s:.1f}", "s"))
+    if len(trajectory) and not np.isfinite(trajectory.confidences).any():
+        rows.append(Row("covariances", "none: the method does not say how sure it is"))
     if result.truth is not None and len(trajectory) > 1:
         rows += accuracy_rows(trajectory.Ts_world_lidar, result.truth)
     return rows

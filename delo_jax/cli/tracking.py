@@ -17,20 +17,19 @@ import jax
 import numpy as np
 
 import delo_jax
-from delo_jax import inference, weights
 from delo_jax.cli.command import Command
-from delo_jax.cli.console import interruptible, progress, working
+from delo_jax.cli.console import interruptible, progress
+from delo_jax.cli.method import Opened, open_method, package_versions
 from delo_jax.cli.refinement import Refinement, refine, write
 from delo_jax.config import DeloConfig, to_toml
 from delo_jax.data.fields import RawScan
 from delo_jax.errors import ConfigError, DeloError, ScanError
-from delo_jax.model.delo import Model
+from delo_jax.pipeline.baseline_odometry import BaselineOdometry
 from delo_jax.pipeline.lidar_odometry import Frame, LidarOdometry
-from delo_jax.pipeline.scan_to_map import compile_steps
 from delo_jax.pipeline.trajectory import RunWriter, Trajectory
 from delo_jax.refine.refiner import Refiner, Tracked
+from delo_jax.report.cloud import DriveCloud
 from delo_jax.report.figures import trajectory_figure
-from delo_jax.uncertainty import stream
 
 STAGES = ("prepare", "solve", "insert")
 
@@ -72,7 +71,8 @@ class Job:
     """Effective options; they go to config.toml."""
     source: Scans
     folder: Path
-    weights: str
+    weights: str | None
+    """Released ones by name, or a file; None: a method without any."""
     use_map: bool
     deskew: bool
     refine: bool
@@ -81,6 +81,8 @@ class Job:
     """What getting a scan is called in the timing."""
     facts: dict[str, Any]
     """What run.json says about the data."""
+    method: str = "delo"
+    """Name in `baselines.registry`."""
 
 
 class Result(NamedTuple):
@@ -94,12 +96,14 @@ class Result(NamedTuple):
     truth: np.ndarray | None
     """Of the frames that were tracked."""
     refinement: Refinement | None
+    cloud: DriveCloud
+    """What the scans saw, thinned."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Effective:
     run: Command
-    model: DeloConfig
+    model: DeloConfig | None
 
 
 def new_folder(asked: Path | None, name: str) -> Path:
@@ -116,40 +120,29 @@ def new_folder(asked: Path | None, name: str) -> Path:
     return asked
 
 
-def compile_model(params: Model, *, use_map: bool) -> float:
-    """Compiles everything that odometry will call, and returns how long it took [s]: shapes are fixed, so a scan without points does."""
-    begin = time.perf_counter()
-    empty = inference.prepare(params, np.zeros((0, 3), np.float32))
-    inference.align(params, empty, empty, np.eye(4))
-    if use_map:
-        compile_steps(params)
-    return time.perf_counter() - begin
-
-
 def track(job: Job) -> Result:
     """Odometry over all scans of a job, written to its folder as it goes.
 
     Raises:
-        DeloError: weights that cannot be used, or a folder that cannot be written.
+        DeloError: weights that cannot be used, a missing package, or a folder that cannot be written.
     """
-    params, card = weights.load(job.weights), weights.read_card(job.weights)
-    odometry = LidarOdometry(params, use_map=job.use_map, deskew=job.deskew, stamp_sigma_s=job.stamp_sigma_s)
-    with working("compiling"):
-        compile_s = compile_model(params, use_map=job.use_map)
-    print(f"compiled in {compile_s:.1f} s")
-    facts = _facts(job, params, card, compile_s)
+    opened = open_method(job.method, weights_name=job.weights, use_map=job.use_map, deskew=job.deskew, stamp_sigma_s=job.stamp_sigma_s)
+    odometry, params = opened.odometry, opened.params
+    if opened.compile_s:
+        print(f"compiled in {opened.compile_s:.1f} s")
+    facts = _facts(job, opened)
     try:
         job.folder.mkdir(parents=True, exist_ok=True)
-        (job.folder / "config.toml").write_text(to_toml(_Effective(job.command, params.cfg)))
+        (job.folder / "config.toml").write_text(to_toml(_Effective(job.command, None if params is None else params.cfg)))
         write_json(job.folder / "run.json", facts | {"state": "running"})
         writer = RunWriter(job.folder, T_cam_lidar=job.source.T_cam_lidar, timing_names=(job.stage, *STAGES))
     except OSError as error:
         raise ConfigError(f"--out {job.folder}: expected a folder to write to, got {error.strerror}; choose another") from error
-    refiner = Refiner(params) if job.refine else None
+    refiner, cloud = Refiner(params) if job.refine and params is not None else None, DriveCloud()
     try:
         with writer:
-            acquired, interrupted = _loop(job, odometry, writer, refiner)
-        result = _result(job, odometry.trajectory(), acquired, compile_s, interrupted)
+            acquired, interrupted = _loop(job, odometry, writer, refiner, cloud)
+        result = _result(job, odometry.trajectory(), acquired, opened.compile_s, interrupted, cloud)
         _finish(job, result, facts)
         return result._replace(refinement=_refined(job, refiner, result.trajectory))
     finally:
@@ -170,7 +163,9 @@ def _refined(job: Job, refiner: Refiner | None, trajectory: Trajectory) -> Refin
     return found
 
 
-def _loop(job: Job, odometry: LidarOdometry, writer: RunWriter, refiner: Refiner | None) -> tuple[list[float], bool]:
+def _loop(
+    job: Job, odometry: LidarOdometry | BaselineOdometry, writer: RunWriter, refiner: Refiner | None, cloud: DriveCloud
+) -> tuple[list[float], bool]:
     """All frames; the seconds it took to get each scan, and whether Ctrl-C ended it."""
     acquired: list[float] = []
     stamps_ns = job.source.stamps_ns
@@ -185,8 +180,10 @@ def _loop(job: Job, odometry: LidarOdometry, writer: RunWriter, refiner: Refiner
             acquired.append(time.perf_counter() - begin)
             frame = _register(odometry, scan, stamp_ns)
             writer.append(frame._replace(timing={job.stage: acquired[-1], **frame.timing}))
-            if refiner is not None:
+            if refiner is not None and isinstance(odometry, LidarOdometry):
                 refiner.add(Tracked(frame.since, frame.T_world_lidar, frame.covariance, frame.local, odometry.last_scan))
+            if frame.status != "rejected" and not isinstance(scan, str):
+                cloud.add_scan(index, frame.T_world_lidar, getattr(odometry, "last_scan", None) or scan)  # not every method keeps it
             bar.advance(task)
     return acquired, False
 
@@ -199,7 +196,7 @@ def _acquire(source: Scans, index: int) -> RawScan | str:
         return str(error)
 
 
-def _register(odometry: LidarOdometry, scan: RawScan | str, stamp_ns: int | None) -> Frame:
+def _register(odometry: LidarOdometry | BaselineOdometry, scan: RawScan | str, stamp_ns: int | None) -> Frame:
     """The frame of a scan; a scan that cannot be used is a rejected frame, not the end of the drive."""
     if isinstance(scan, str):
         return odometry.reject(scan, stamp_ns)
@@ -209,10 +206,10 @@ def _register(odometry: LidarOdometry, scan: RawScan | str, stamp_ns: int | None
         return odometry.reject(str(error), stamp_ns)
 
 
-def _result(job: Job, trajectory: Trajectory, acquired: list[float], compile_s: float, interrupted: bool) -> Result:
+def _result(job: Job, trajectory: Trajectory, acquired: list[float], compile_s: float, interrupted: bool, cloud: DriveCloud) -> Result:
     timing = {name: np.array([record.timing.get(name, np.nan) for record in trajectory.records]) for name in STAGES}
     truth = None if job.source.truth is None else job.source.truth[: len(trajectory)]
-    return Result(trajectory, {job.stage: np.array(acquired), **timing}, compile_s, interrupted, truth, None)
+    return Result(trajectory, {job.stage: np.array(acquired), **timing}, compile_s, interrupted, truth, None, cloud)
 
 
 def percentiles_ms(seconds: np.ndarray) -> tuple[float, float] | None:
@@ -229,18 +226,19 @@ def _finish(job: Job, result: Result, facts: dict[str, Any]) -> None:
     state = "interrupted" if result.interrupted else "complete"
     write_json(job.folder / "run.json", facts | {"state": state, "frames": counts, "timing_ms": timing})
     if len(trajectory):
+        known = bool(np.isfinite(trajectory.confidences).any())  # NaN of a method without uncertainty
         trajectory_figure(
             job.folder / "trajectory.png",
             trajectory.Ts_world_lidar,
             trajectory.statuses,
-            sigmas=trajectory.sigmas,
-            confidences=trajectory.confidences,
+            sigmas=trajectory.sigmas if known else None,
+            confidences=trajectory.confidences if known else None,
             truth=result.truth,
             title=f"{job.source.name}, {len(trajectory)} scans",
         )
 
 
-def _facts(job: Job, params: Model, card: dict[str, Any], compile_s: float) -> dict[str, Any]:
+def _facts(job: Job, opened: Opened) -> dict[str, Any]:
     T_cam_lidar = job.source.T_cam_lidar
     return {
         "versions": {
@@ -248,22 +246,14 @@ def _facts(job: Job, params: Model, card: dict[str, Any], compile_s: float) -> d
             "jax": jax.__version__,
             "numpy": version("numpy"),
             "python": platform.python_version(),
+            **package_versions(job.method),
         },
-        "weights": {"name": job.weights, "sha256": card["sha256"]},
+        **opened.facts,
         **job.facts,
         "num_scans": len(job.source),
         "poses_kitti_frame": "lidar" if T_cam_lidar is None else "camera",
         "T_cam_lidar": None if T_cam_lidar is None else T_cam_lidar.tolist(),
-        "uncertainty": _uncertainty(job, params),
-        "compile_s": round(compile_s, 3),
     }
-
-
-def _uncertainty(job: Job, params: Model) -> str:
-    """Where the covariances are from."""
-    calibrated = stream.NAME in params.variables if job.use_map else params.cfg.evidence.covariance_width > 0
-    source = "fitted on simulated " + ("drives" if job.use_map else "pairs")
-    return source if calibrated else f"{'information matrix' if job.use_map else 'evidence head'}, not calibrated"
 
 
 def write_json(path: Path, table: dict[str, Any]) -> None:

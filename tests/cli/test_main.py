@@ -51,7 +51,7 @@ def test_options_in_toml(cli):
     """Oracle: the standard library's TOML parser; a path may hold quotes, backslashes and line breaks."""
     done = cli("run", 'a "b"\\c\nd', "--deskew", "off", "--dump-config", "--weights", "w")
     expected = {"path": 'a "b"\\c\nd', "weights": "w", "map": "local", "deskew": "off", "no_elevation_correction": False}
-    assert tomllib.loads(done.out) == expected | {"refine": False, "stamp_sigma_ms": 1.0}
+    assert tomllib.loads(done.out) == expected | {"method": "delo", "refine": False, "stamp_sigma_ms": 1.0}
 
 
 def test_training_options_can_be_trained_with(cli, tmp_path):

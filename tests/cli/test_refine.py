@@ -15,6 +15,7 @@ from delo_jax.inference import Estimate
 from delo_jax.refine import refiner
 from tests.refine.graphs import SIGMAS
 from tests.refine.test_loops import graph, round_trip
+from tests.report.pages import page_data
 
 NAME = "mixed-50"
 CALIBRATION = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]])  # that the tree is written with
@@ -55,6 +56,8 @@ def test_refined_later_is_refined_on_the_way(folder, cli, tmp_path):
     assert "ATE" in done.out
     for name in FILES[:2]:
         np.testing.assert_allclose(np.loadtxt(copy / name), np.loadtxt(folder / name), atol=1e-5)
+    for path in (copy, folder):
+        np.testing.assert_allclose(np.transpose(page_data(path)["refined"]), np.loadtxt(path / FILES[0])[:, 1:4], atol=1e-3)
     ours, first = (np.load(path / FILES[2]) for path in (copy, folder))
     np.testing.assert_allclose(ours, first, rtol=1e-2, atol=1e-9)
 

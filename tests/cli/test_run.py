@@ -14,8 +14,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from delo_jax import weights
+from delo_jax.cli import main
 from delo_jax.data.sequence import Dataset
 from tests.fixtures import narrow_model
+from tests.report.pages import page_data
 
 NUM_SCANS, NAME = 8, "mixed-50"  # of the tree
 CALIBRATION = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]])  # that the tree is written with
@@ -65,6 +67,10 @@ def test_files_agree_with_each_other_and_with_the_truth(folder, tree):
     true = np.linalg.inv(CALIBRATION) @ read_rows(tree / "poses" / f"{NAME}.txt") @ CALIBRATION
     assert np.linalg.norm(lidar[:, :3, 3] - true[:, :3, 3], axis=1).max() < 0.5
     assert (folder / "trajectory.png").read_bytes().startswith(b"\x89PNG")
+    page = page_data(folder)
+    np.testing.assert_allclose(np.transpose(page["track"]), tum[:, 1:4], atol=1e-3)
+    np.testing.assert_allclose(np.transpose(page["truth"]), true[:, :3, 3], atol=1e-3)
+    assert page["cloud"]["count"] > 1000
 
 
 def test_what_the_run_says_of_itself(folder, tree, weights_file):
@@ -105,6 +111,49 @@ def test_a_network_without_a_fine_stage_needs_no_map(tree, cli, tmp_path):
     assert "expected a network with a fine stage" in done.err
     assert "--map none" in done.err
     assert cli("run", tree, "--weights", str(file), "--map", "none", "--out", tmp_path / "out").code == 0
+
+
+@pytest.mark.parametrize(("method", "bound_m"), [("point-to-plane", 0.1), ("identity", 0.1)])
+def test_another_method_leaves_the_same_files(tree, tmp_path, capfd, method, bound_m):
+    """Oracle: the simulator's poses of a car that hardly moves, loosely; NaN; the sentence of `delo refine`."""
+    out = tmp_path / "out"
+    assert main(["run", str(tree), "--method", method, "--out", str(out)]) == 0
+    assert "the method does not say how sure it is" in " ".join(capfd.readouterr().out.replace("│", " ").split())
+    assert check_whole(out) == NUM_SCANS
+    facts = json.loads((out / "run.json").read_text())
+    assert (facts["method"], facts["weights"], facts["map"], facts["frames"]) == (method, None, None, {"ok": NUM_SCANS})
+    assert facts["uncertainty"].startswith(f"none: {method} does not say")
+    assert tomllib.loads((out / "config.toml").read_text())["run"]["method"] == method
+    for name in ("covariances", "pose_covariances", "local_covariances"):
+        assert np.isnan(np.load(out / f"{name}.npy")).all()
+    with (out / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert all(np.isnan(float(row[name])) for row in rows for name in row if name.startswith("sigma") or name == "confidence")
+    true, found = read_rows(tree / "poses" / f"{NAME}.txt"), read_rows(out / "poses_kitti.txt")
+    assert np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1).max() < bound_m
+    assert main(["eval", str(out)]) == 0
+    capfd.readouterr()
+    assert main(["refine", str(out)]) == 2
+    assert f"expected a run of --method delo, whose covariances say what a motion counts, got one of {method}" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("identity", "--weights", "delo-base"), "--weights: expected a method with a network, got --method identity"),
+        (("icp", "--map", "local"), "--map local: expected --method delo, got icp"),
+        (("icp", "--refine"), "--refine: expected --method delo"),
+        (("dcp",), "--method dcp: expected weights trained by `delo train dcp`, got none"),
+        (("dcp", "--weights", "delo-base"), "--method dcp: expected weights of the preset dcp, got the preset base"),
+    ],
+)
+def test_options_that_mean_nothing_to_a_method(tree, tmp_path, capfd, options, words):
+    """Oracle: exit code 2, one sentence, and no folder."""
+    assert main(["run", str(tree), "--out", str(tmp_path / "out"), "--method", *options]) == 2
+    error = capfd.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_same_bytes_twice_in_numbered_folders(folder, tree, cli, monkeypatch, tmp_path):
@@ -168,6 +217,7 @@ def test_ctrl_c_keeps_whole_frames(tree, cli, monkeypatch, tmp_path):
     assert check_whole(tmp_path / "out") == 4
     assert json.loads((tmp_path / "out" / "run.json").read_text())["state"] == "interrupted"
     assert (tmp_path / "out" / "trajectory.png").exists()
+    assert page_data(tmp_path / "out")["n"] == 4
     assert signal.getsignal(signal.SIGINT) is before
 
 

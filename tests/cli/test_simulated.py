@@ -14,6 +14,7 @@ from delo_jax.data import open_dataset
 from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.sim.drive import DRIVE_SEED
 from delo_jax.train.validate import GapErrors
+from tests.report.pages import page_data
 
 WITHOUT_SOCKETS = """
 import sys
@@ -43,6 +44,7 @@ def test_demo_opens_no_socket(weights_file, tmp_path):
         assert {"simulate_ms", "prepare_ms", "solve_ms"} <= set(next(csv.DictReader(file)))
     estimate, truth = np.loadtxt(out / "trajectory.tum"), np.loadtxt(out / "truth.tum")
     assert len(estimate) == len(truth) == 5
+    np.testing.assert_allclose(np.transpose(page_data(out)["truth"]), truth[:, 1:4], atol=1e-3)
     np.testing.assert_array_equal(estimate[:, 0], truth[:, 0])
     drive = list(sim.simulate_drive("urban", DRIVE_SEED + 63, 5, rolling_shutter=True))
     T_first_last = np.linalg.inv(drive[0].T_world_lidar) @ drive[-1].T_world_lidar

@@ -1,0 +1,1 @@
+"""Other methods behind two protocols: pairs of scans, and whole drives; `registry.METHODS` lists them."""
