@@ -38,9 +38,16 @@ KINDS = {  # of the worlds beside KITTI's routes
 }
 WHOLE, EXCERPT = ("04", "07", "10"), 300
 PACKAGE = Path(delo_jax.__file__).parent
-OTHERS = ("geometry", "data", "preprocess.py", "baselines", "pipeline/baseline_odometry.py", "pipeline/motion_model.py")
-OWN = ("geometry", "ops", "model", "uncertainty", "data", "preprocess.py", "inference.py", "pipeline/lidar_odometry.py") + tuple(
-    f"pipeline/{name}.py" for name in ("local_map", "motion_model", "scan_to_map")
+OTHERS = (
+    "geometry",
+    "data",
+    "preprocess.py",
+    "baselines",
+    *(f"pipeline/{name}.py" for name in ("baseline_odometry", "motion_model", "stamps")),
+)
+OWN = (
+    *("geometry", "ops", "model", "uncertainty", "data", "preprocess.py", "inference.py"),
+    *(f"pipeline/{name}.py" for name in ("lidar_odometry", "local_map", "motion_model", "scan_to_map", "stamps")),
 )  # parts of the package that results depend on
 RENDERING = ("sim",)
 

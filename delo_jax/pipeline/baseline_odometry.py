@@ -6,12 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from delo_jax.baselines.protocols import MIN_POINTS, Aligned, Sweep, Tracker, too_few, usable
-from delo_jax.data.fields import FRAME_PERIOD_NS
-from delo_jax.errors import ScanError
 from delo_jax.geometry.deskew import deskew
 from delo_jax.inference import Estimate
 from delo_jax.pipeline.lidar_odometry import Frame
 from delo_jax.pipeline.motion_model import NANOSECOND, ConstantVelocity
+from delo_jax.pipeline.stamps import checked_stamp, checked_times
 from delo_jax.pipeline.trajectory import Trajectory
 from delo_jax.preprocess import check_points
 
@@ -55,8 +54,7 @@ class BaselineOdometry:
             ScanError: wrong shape or dtype, or a stamp that does not rise; the state is as if the scan never arrived.
         """
         points, stamp_ns = check_points(points), self._check_stamp(stamp_ns)
-        if times_s is not None and np.shape(times_s) != (len(points),):
-            raise ScanError(f"times_s: expected one time per point, shape ({len(points)},), got {np.shape(times_s)}")
+        times_s = checked_times(times_s if self._deskew else None, len(points))
         begin = time.perf_counter()
         points, times_s = usable(points, np.nan_to_num(times_s, posinf=0.0, neginf=0.0) if self._deskew and times_s is not None else None)
         if len(points) < MIN_POINTS:
@@ -81,11 +79,7 @@ class BaselineOdometry:
         return self._trajectory
 
     def _check_stamp(self, stamp_ns: int | None) -> int:
-        if stamp_ns is None:
-            return self._last_stamp_ns + FRAME_PERIOD_NS if self._num_frames else 0
-        if self._num_frames and stamp_ns <= self._last_stamp_ns:
-            raise ScanError(f"stamp_ns: expected more than the last stamp {self._last_stamp_ns}, got {stamp_ns}; sort the scans by time")
-        return int(stamp_ns)
+        return checked_stamp(stamp_ns, self._last_stamp_ns if self._num_frames else None)
 
     def _elapsed_s(self, stamp_ns: int) -> float:
         return 0.0 if self._last is None else (stamp_ns - self._last.stamp_ns) * NANOSECOND

@@ -8,13 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from delo_jax import inference
-from delo_jax.data.fields import FRAME_PERIOD_NS, MAX_SWEEP_S
-from delo_jax.errors import ScanError
 from delo_jax.geometry import se3
 from delo_jax.inference import Estimate, PreparedScan
 from delo_jax.model.delo import Model
 from delo_jax.pipeline.motion_model import NANOSECOND, ConstantVelocity, is_near
 from delo_jax.pipeline.scan_to_map import Located, MapTracker, Steps
+from delo_jax.pipeline.stamps import checked_stamp, checked_times
 from delo_jax.pipeline.trajectory import Trajectory
 from delo_jax.preprocess import check_points
 from delo_jax.uncertainty import covariance, stream
@@ -131,7 +130,7 @@ class LidarOdometry:
                 scan never arrived.
         """
         points, stamp_ns = check_points(points), self._check_stamp(stamp_ns)
-        times_s = self._check_times(times_s, len(points))
+        times_s = checked_times(times_s if self._deskew else None, len(points))
         begin = time.perf_counter()
         scan = self._prepare(self._params, points, times_s).still(self._motion_model.velocity)
         target = Source(scan, stamp_ns, self._num_frames)
@@ -155,24 +154,7 @@ class LidarOdometry:
         return self._trajectory
 
     def _check_stamp(self, stamp_ns: int | None) -> int:
-        if stamp_ns is None:
-            return self._last_stamp_ns + FRAME_PERIOD_NS if self._num_frames else 0
-        if self._num_frames and stamp_ns <= self._last_stamp_ns:
-            raise ScanError(f"stamp_ns: expected more than the last stamp {self._last_stamp_ns}, got {stamp_ns}; sort the scans by time")
-        return int(stamp_ns)
-
-    def _check_times(self, times_s: np.ndarray | None, num_points: int) -> np.ndarray | None:
-        if times_s is None or not self._deskew:
-            return None
-        times_s = np.asarray(times_s)
-        if times_s.shape != (num_points,):
-            raise ScanError(f"times_s: expected one time per point, shape ({num_points},), got {times_s.shape}")
-        if times_s.dtype.kind not in "fiu":
-            raise ScanError(f"times_s: expected numbers, got dtype {times_s.dtype}; convert to float64")
-        farthest_s = np.max(np.abs(times_s), initial=0.0, where=np.isfinite(times_s))
-        if farthest_s > MAX_SWEEP_S:
-            raise ScanError(f"times_s: expected seconds relative to the stamp, within {MAX_SWEEP_S:g} s, got {farthest_s:g} s")
-        return times_s
+        return checked_stamp(stamp_ns, self._last_stamp_ns if self._num_frames else None)
 
     def _locate(self, target: Source) -> Answer:
         """Motion to a new scan from the last good one, or from a doubtful one that it fits better."""
