@@ -3,13 +3,18 @@
 DELO_DATA=DIR          a KITTI-like tree of real scans; tests marked `data` skip without it
 DELO_REQUIRE_DATA=1    a `data` test that skips is a failure (continuous integration)
 DELO_TEST_GPU=1        leave the choice of device to JAX; tests marked `gpu` skip without it
+
+Compiled code is kept in a temporary folder that all processes of a run share, and the next run finds again.
 """
 
 import os
+import tempfile
 from pathlib import Path
 
 if not os.environ.get("DELO_TEST_GPU"):
     os.environ["JAX_PLATFORMS"] = "cpu"  # read once, when JAX starts
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / "delo-jax-tests"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 import hypothesis
 import jax

@@ -1,8 +1,11 @@
 """The command `delo`. Nothing heavy is imported before a command runs."""
 
+import hashlib
 import os
+import platform
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import tyro
 
@@ -46,6 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if command.dump_config:
             print(to_toml(command.effective()), end="")
             return 0
+        keep_compiled()
         return command.run()
     except SystemExit as stop:  # of the parser: after --help, or a mistake that it has described
         return stop.code if isinstance(stop.code, int) else USAGE
@@ -56,6 +60,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:  # the last resort: a user never sees a traceback unasked
         text = " ".join(str(error).split())[:300] or "no message"
         return _say(f"unexpected {type(error).__name__}: {text}; set DELO_DEBUG=1 for the traceback", FELL_SHORT, error)
+
+
+def keep_compiled() -> None:
+    """Lets JAX keep what it compiles in the user's cache, so that only the first start waits for it; a folder that the user has set stands.
+
+    A folder for each kind of processor: compiled code is made for the instructions of one.
+    """
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = root / "delo-jax" / f"compiled-{_processor()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return  # nowhere to keep it: it is compiled each time
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))  # read when JAX is imported
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+
+
+def _processor() -> str:
+    """Eight characters that tell kinds of processors apart."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        flags = next(line for line in lines if line.startswith(("flags", "Features")))
+    except (OSError, StopIteration):
+        flags = platform.processor()
+    return hashlib.sha256(f"{platform.machine()} {flags}".encode()).hexdigest()[:8]
 
 
 def _parse(argv: Sequence[str]) -> Command:

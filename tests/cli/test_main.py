@@ -1,3 +1,5 @@
+import os
+import pathlib
 import re
 import subprocess
 import sys
@@ -116,3 +118,45 @@ def test_interrupted_anywhere(monkeypatch, cli):
 
     monkeypatch.setattr(delo_jax.cli.Doctor, "run", interrupt)
     assert cli("doctor") == (1, "", "delo: interrupted\n")
+
+
+def test_compiled_code_is_kept_for_the_next_start(monkeypatch, tmp_path):
+    """Oracle: JAX's own variables, in the user's cache folder; those that are set stand, and no folder is no error."""
+    for name in ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
+        monkeypatch.setenv(name, "")  # so that what is set below is undone
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    delo_jax.cli.keep_compiled()
+    folder = pathlib.Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
+    assert folder.is_dir()
+    assert folder.parent == tmp_path / "delo-jax"
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "elsewhere")
+    delo_jax.cli.keep_compiled()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "elsewhere"
+    (tmp_path / "file").touch()
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    delo_jax.cli.keep_compiled()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+
+
+def test_second_start_compiles_less(tmp_path):
+    """Oracle: JAX's own events: what the first process compiled, the second one reads."""
+    code = """if True:
+        from delo_jax.cli import keep_compiled
+        keep_compiled()
+        import jax
+        hits = []
+        jax.monitoring.register_event_listener(lambda event, **_: hits.append(event) if event.endswith("cache_hits") else None)
+        import numpy as np
+        import delo_jax
+        scan = np.random.default_rng(0).uniform(-20.0, 20.0, (2000, 3))
+        delo_jax.odometry(delo_jax.load("delo-base"), scan, scan)
+        print("HITS", len(hits))
+    """
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_COMPILATION")}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
+    runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment) for _ in range(2)]
+    first, second = (int(run.stdout.split("HITS")[1]) for run in runs)
+    assert first == 0
+    assert second >= 2
