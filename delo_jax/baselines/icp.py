@@ -15,7 +15,7 @@ from delo_jax.preprocess import LEAF_SIZE, voxel_mean
 
 VOXEL_M = 0.25
 GATES_M = (2.0, 0.5)  # a match farther apart is none; the second holds once steps with the first have settled
-BUCKETS = (16384, 65536)  # rows that clouds are padded to; one with more loses some
+NUM_MOVED = 4096  # points of the source, at even distances in the cloud, that are matched; the rows of every step
 MAX_ITERS = 50  # a gate
 SETTLED_RAD, SETTLED_M = (1e-3, 1e-4), (1e-2, 1e-3)  # a step below both is the last of a gate
 NUM_NEIGHBORS, PLANE_RADIUS_M, MIN_NEIGHBORS, PLANAR = 12, 1.5, 5, 0.1  # of plane fits; variances across and along
@@ -47,25 +47,25 @@ class Icp(PairMethod):
     step = staticmethod(_towards_points)
 
     def compile(self) -> None:
-        """Compiles the step for every size of a cloud."""
-        for rows in BUCKETS:
-            nothing = np.zeros((rows, 3), np.float32)
-            jax.block_until_ready(self.step(nothing, nothing, nothing, nothing[:, 0]))
+        """Compiles the step."""
+        nothing = np.zeros((NUM_MOVED, 3), np.float32)
+        jax.block_until_ready(self.step(nothing, nothing, nothing, nothing[:, 0]))
 
     def prepare(self, points: np.ndarray) -> Cloud:
         """Means of voxels, and a tree of them."""
         thin = voxel_mean(points.astype(np.float32), VOXEL_M)
-        if len(thin) > BUCKETS[-1]:
-            thin = thin[np.linspace(0, len(thin), BUCKETS[-1], endpoint=False).astype(np.int64)]
         tree = cKDTree(thin, leafsize=LEAF_SIZE, balanced_tree=False, compact_nodes=False)
         return Cloud(thin, tree, *self._planes(thin, tree))
 
     def align(self, source: Cloud, target: Cloud, T_target_source_init: np.ndarray) -> Aligned:
         """T_target_source from a start; without a single match the start."""
         T, settled = np.array(T_target_source_init, np.float64), False
+        points = source.points
+        if len(points) > NUM_MOVED:
+            points = points[np.linspace(0, len(points), NUM_MOVED, endpoint=False).astype(np.int64)]
         for gate_m, least_rad, least_m in zip(GATES_M, SETTLED_RAD, SETTLED_M, strict=True):
             for _ in range(MAX_ITERS):
-                delta = self._delta(source, target, T, gate_m)
+                delta = self._delta(points, target, T, gate_m)
                 if not np.isfinite(delta).all():
                     return Aligned.of(T_target_source_init, f"no match within {gate_m:g} m", status="rejected")
                 T = se3.orthonormal(delta @ T)
@@ -74,16 +74,16 @@ class Icp(PairMethod):
                     break
         return Aligned.of(T, "" if settled else f"not converged after {MAX_ITERS} iterations")
 
-    def _delta(self, source: Cloud, target: Cloud, T: np.ndarray, gate_m: float) -> np.ndarray:
+    def _delta(self, points: np.ndarray, target: Cloud, T: np.ndarray, gate_m: float) -> np.ndarray:
         """One step, a correction in the target frame; NaN without a match."""
-        moved, rows = source.points @ T[:3, :3].T + T[:3, 3], next(rows for rows in BUCKETS if rows >= len(source.points))
+        moved = points @ T[:3, :3].T + T[:3, 3]
         distances, index = target.tree.query(moved, distance_upper_bound=gate_m)
         index = np.minimum(index, len(target.points) - 1)  # where nothing is within reach it is one too many
         weights = (distances < gate_m) & target.planar[index]
         if not weights.any():
             return np.full((4, 4), np.nan)
         matched = (moved, target.points[index], target.normals[index], weights)
-        return np.asarray(self.step(*(_padded(array, rows) for array in matched)), np.float64)
+        return np.asarray(self.step(*map(_padded, matched)), np.float64)
 
     def _planes(self, points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray]:
         """Normals of the points, and which of them count; points need none."""
@@ -103,7 +103,7 @@ class PointToPlane(Icp):
         return fit.normal, flat & (near.sum(axis=1) >= MIN_NEIGHBORS)
 
 
-def _padded(array: np.ndarray, rows: int) -> np.ndarray:
-    padded = np.zeros((rows, *array.shape[1:]), np.float32)
+def _padded(array: np.ndarray) -> np.ndarray:
+    padded = np.zeros((NUM_MOVED, *array.shape[1:]), np.float32)
     padded[: len(array)] = array
     return padded

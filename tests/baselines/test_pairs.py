@@ -3,7 +3,7 @@ import pytest
 from scipy.linalg import expm
 
 import delo_jax
-from delo_jax.baselines.icp import BUCKETS, Icp
+from delo_jax.baselines.icp import NUM_MOVED, Icp
 from delo_jax.baselines.network import Network
 from delo_jax.baselines.prediction import MEAN_VELOCITY
 from delo_jax.baselines.protocols import MIN_POINTS
@@ -53,11 +53,10 @@ def test_what_is_ours_gives_the_same_bytes_and_no_pose_without_a_match(name):
 
 
 def test_padding_changes_nothing():
-    """Oracle: the same scan in a larger bucket, whose other rows have no weight."""
+    """Oracle: the same few points with more rows beside them, which have no weight."""
     icp, (source, target) = Icp(), (street.scan(street.pose(x), noise_m=0.01, seed=k).points for k, x in enumerate((0.0, 0.4)))
-    clouds = icp.prepare(source[::7]), icp.prepare(target)
-    rows = len(clouds[0].points)
-    assert rows < BUCKETS[0]
+    clouds = icp.prepare(source[::28]), icp.prepare(target)
+    assert len(clouds[0].points) < NUM_MOVED
     few = icp.align(*clouds, np.eye(4)).T_target_source
     icp_larger = Icp()
     icp_larger.step = lambda *arrays: Icp.step(*(np.concatenate([array, np.zeros_like(array)]) for array in arrays))
