@@ -10,6 +10,7 @@ from pathlib import Path
 import tyro
 
 import delo_jax
+from delo_jax.cli.bench import Bench
 from delo_jax.cli.calibrate import Calibrate
 from delo_jax.cli.command import Command
 from delo_jax.cli.demo import Demo
@@ -31,6 +32,7 @@ COMMANDS: dict[str, type[Command]] = {
     "train": Train,
     "calibrate": Calibrate,
     "doctor": Doctor,
+    "bench": Bench,
 }
 FELL_SHORT, USAGE = 1, 2
 
