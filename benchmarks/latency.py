@@ -1,6 +1,6 @@
 """Time of every stage of a pair by preset and number of points, of streams and of training, on full simulated HDL-64E scans.
 
-Run:     python benchmarks/latency.py [--quick]        (about eight minutes on 2 cores; options are those of `delo bench`)
+Run:     python benchmarks/latency.py [--quick]        (about ten minutes on 2 cores; options are those of `delo bench`)
 
 Compared with baseline.json; exits 1 when a ratio within the run has got worse than its tolerance there. Renewed on an idle machine by
 `python benchmarks/latency.py --json benchmarks/baseline.json`.

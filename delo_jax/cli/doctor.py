@@ -62,7 +62,7 @@ def _devices() -> Iterator[Check]:
     try:
         names = [device.device_kind for device in jax.devices()]
         yield Check("devices", f"{', '.join(names)}; {os.cpu_count()} cores")
-        yield Check("compiled code", jax.config.jax_compilation_cache_dir or "not kept")
+        yield Check("compiled code", jax.config.values["jax_compilation_cache_dir"] or "not kept")
     except RuntimeError as error:
         yield Check("devices", " ".join(str(error).split())[:200], "set JAX_PLATFORMS=cpu, or reinstall jax for this machine")
 
