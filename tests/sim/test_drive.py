@@ -66,7 +66,7 @@ def test_training_never_sees_a_drive(validation, monkeypatch, tmp_path):
     seeds = set()
     monkeypatch.setattr(worlds, "make_world", lambda index, *, seed, **_: seeds.add(seed + index))
     monkeypatch.setattr(worlds, "write_world", lambda path, world: None)
-    monkeypatch.setattr(worlds, "read_world", lambda path: None)
+    monkeypatch.setattr(worlds, "read_world", lambda path: worlds.World(None, None))
     for cfg in PRESETS.values():
         for seed in range(6):
             list(worlds.worlds(dataclasses.replace(cfg, seed=seed), tmp_path, validation=validation))
