@@ -10,11 +10,10 @@ from _routes import calibration, official, whole
 from delo_jax.data import camera_to_lidar, lidar_to_camera
 from delo_jax.errors import DatasetError
 from delo_jax.geometry import se3
-from delo_jax.metrics.drift import KITTI_LENGTHS_M, Segments, mean_drift, segment_errors
+from delo_jax.metrics.drift import Segments, mean_drift, segments_that_fit
 from delo_jax.metrics.frames import compare_frames
 
 EQUAL = 2e-4  # of motions, in matrix entries [1, m]: files of seven digits, chained
-SHORT_M = tuple(range(10, 51, 10))  # on paths below 100 m
 
 
 class Number(NamedTuple):
@@ -57,17 +56,15 @@ class Tree:
 
 
 def number(Ts_estimated: np.ndarray, Ts_true: np.ndarray) -> Number:
-    """Drift over 100-800 m; of paths below 100 m over 10-50 m, from every frame."""
+    """Drift over the segments that fit."""
     num = min(len(Ts_estimated), len(Ts_true))
     Ts_estimated, Ts_true = Ts_estimated[:num], Ts_true[:num]
     match = compare_frames(Ts_estimated, Ts_true)
     if not match.agree:
         raise DatasetError(f"expected estimate and truth in one frame, got axes {match.estimated_axis} and {match.true_axis}")
-    length_m = np.linalg.norm(np.diff(Ts_true[:, :3, 3], axis=0), axis=1).sum()
-    if length_m > KITTI_LENGTHS_M[0]:
-        segments = segment_errors(Ts_estimated, Ts_true)
-    else:
-        segments = segment_errors(Ts_estimated, Ts_true, lengths_m=SHORT_M, step=1)
+    segments = segments_that_fit(Ts_estimated, Ts_true)
+    if segments is None:
+        raise DatasetError("expected a path of more than 10 m, got a shorter one; nothing drifts on it")
     drift = mean_drift(segments)
     return Number(drift.r_rel_deg_per_100m, drift.t_rel_percent, segments)
 

@@ -30,12 +30,11 @@ from delo_jax import weights
 from delo_jax.baselines.registry import METHODS
 from delo_jax.errors import ConfigError, DeloError
 from delo_jax.metrics.ate import absolute_errors
-from delo_jax.metrics.drift import KITTI_LENGTHS_M, Drift, Segments, joined, mean_drift, segment_errors
+from delo_jax.metrics.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift, Segments, joined, mean_drift, segment_errors
 from delo_jax.model.delo import Model
 from delo_jax.pipeline.baseline_odometry import BaselineOdometry
 
 SEQUENCES = ("odo_00_056", "odo_04_000", "raw_0926_0013")
-SHORT_M = (10.0, 20.0, 30.0, 40.0, 50.0)
 OURS, NO_MAP = "delo", "delo, no map"
 PAIRS_ONLY = ("kiss-matcher",)  # takes most of a second a scan, and is no odometry
 LOST_M, LOST_DEG = 0.5, 2.0
@@ -182,7 +181,7 @@ def main(argv: list[str] | None = None) -> int:
                 results[-1].append(run(sequence, methods, args.out, bar))
                 bar.advance(task)
     rows: list[Row] = []
-    lengths = (SHORT_M if args.quick else KITTI_LENGTHS_M), SHORT_M
+    lengths = (SHORT_LENGTHS_M if args.quick else KITTI_LENGTHS_M), SHORT_LENGTHS_M
     titles = "Simulated drives along KITTI's motions", "Recorded sequences"
     for title, lengths_m, group, found in zip(titles, lengths, both, results, strict=True):
         tables = []

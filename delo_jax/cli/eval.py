@@ -61,6 +61,7 @@ class Eval(Command):
     def run(self) -> int:
         """Prints the frames and two tables."""
         from delo_jax.cli.console import print_table
+        from delo_jax.metrics.drift import segments_that_fit
 
         if self.track.is_dir() or not self.track.exists():
             found = of_run(self.track, truth=self.truth, calib=self.calib, refined=self.refined)
@@ -69,7 +70,7 @@ class Eval(Command):
                 raise ConfigError(f"--refined: expected the folder of a run, got the file {self.track}; give the file of the refined poses")
             found = of_file(self.track, truth=self.truth, calib=self.calib)
         Ts_estimated, Ts_true = found.estimate.Ts, found.truth.Ts
-        segments = _segments(Ts_estimated, Ts_true)
+        segments = segments_that_fit(Ts_estimated, Ts_true)
         errors = [*_drift_lines(segments), *_ate_lines(Ts_estimated, Ts_true), *_gap_lines(Ts_estimated, Ts_true, tuple(self.gap))]
         speeds = _speed_lines(segments)
         for line in _header(found):
@@ -98,17 +99,6 @@ def _path_length(Ts: np.ndarray) -> float:
     from delo_jax.cli.summary import path_length
 
     return path_length(Ts)
-
-
-def _segments(Ts_estimated: np.ndarray, Ts_true: np.ndarray) -> "Segments | None":
-    """Those of the benchmark, of 10 to 50 m (from every frame) on shorter paths, None on paths below 10 m."""
-    from delo_jax.cli.summary import SHORT_LENGTHS_M
-    from delo_jax.metrics.drift import KITTI_LENGTHS_M, segment_errors
-
-    length = _path_length(Ts_true)
-    if length > KITTI_LENGTHS_M[0]:
-        return segment_errors(Ts_estimated, Ts_true)
-    return segment_errors(Ts_estimated, Ts_true, lengths_m=SHORT_LENGTHS_M, step=1) if length > SHORT_LENGTHS_M[0] else None
 
 
 def _drift_lines(segments: "Segments | None") -> list[Line]:

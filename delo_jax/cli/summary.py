@@ -9,9 +9,7 @@ from delo_jax.cli.console import Row
 from delo_jax.cli.refinement import Refinement
 from delo_jax.cli.tracking import Result, percentiles_ms
 from delo_jax.metrics.ate import absolute_errors, relative_errors
-from delo_jax.metrics.drift import KITTI_LENGTHS_M, Drift, kitti_drift
-
-SHORT_LENGTHS_M = (10.0, 20.0, 30.0, 40.0, 50.0)
+from delo_jax.metrics.drift import SHORT_LENGTHS_M, Drift, mean_drift, segments_that_fit
 
 
 def run_rows(result: Result) -> list[Row]:
@@ -94,13 +92,9 @@ def accuracy_rows(Ts_estimated: np.ndarray, Ts_true: np.ndarray) -> list[Row]:
 
 
 def drift_where_it_fits(Ts_estimated: np.ndarray, Ts_true: np.ndarray) -> Drift | None:
-    """Drift over the benchmark's segments, over 10 to 50 m on shorter paths (from every frame), None on paths below 10 m."""
-    length = path_length(Ts_true)
-    if length > KITTI_LENGTHS_M[0]:
-        return kitti_drift(Ts_estimated, Ts_true)
-    if length > SHORT_LENGTHS_M[0]:
-        return kitti_drift(Ts_estimated, Ts_true, lengths_m=SHORT_LENGTHS_M, step=1)
-    return None
+    """Mean drift over the segments that fit, None on paths below 10 m."""
+    segments = segments_that_fit(Ts_estimated, Ts_true)
+    return None if segments is None else mean_drift(segments)
 
 
 def span_of(drift: Drift) -> str:

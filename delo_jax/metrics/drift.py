@@ -10,6 +10,8 @@ from delo_jax.errors import DeloError
 from delo_jax.metrics._poses import checked_pair
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+SHORT_LENGTHS_M = (10.0, 20.0, 30.0, 40.0, 50.0)
+"""On paths that are shorter than the benchmark's."""
 KITTI_SPEEDS_MPS = tuple(np.arange(2.0, 25.0, 2.0).tolist())
 """Centres of the benchmark's classes of speed. A class reaches 2 m/s to either side, so that neighbours overlap."""
 KITTI_FRAME_S = 0.1
@@ -118,6 +120,18 @@ def segment_errors(
         t_rel_percent=100.0 * translation_m / lengths[which],
         r_rel_deg_per_100m=100.0 * np.rad2deg(rotation_rad) / lengths[which],
     )
+
+
+def segments_that_fit(Ts_estimated: Float[np.ndarray, "n 4 4"], Ts_true: Float[np.ndarray, "m 4 4"]) -> Segments | None:
+    """Errors of the benchmark's segments, of 10 to 50 m on shorter paths (from every frame); None on paths below 10 m.
+
+    Raises:
+        DeloError: as of `segment_errors`.
+    """
+    length = float(np.sum(_steps(Ts_true)))
+    if length > KITTI_LENGTHS_M[0]:
+        return segment_errors(Ts_estimated, Ts_true)
+    return segment_errors(Ts_estimated, Ts_true, lengths_m=SHORT_LENGTHS_M, step=1) if length > SHORT_LENGTHS_M[0] else None
 
 
 def joined(sequences: Sequence[Segments]) -> Segments:
