@@ -156,7 +156,7 @@ def over_frames(pairs: Pairs, C: np.ndarray, num: int) -> tuple[np.ndarray, np.n
         total = np.zeros((len(starts), 6, 6))
         for step in range(num if len(starts) else 0):
             T_step = pairs.Ts_target_source[starts + step]
-            Ad = se3.adjoint(np.linalg.inv(T_step))
+            Ad = se3.adjoint(se3.inverse(T_step))
             total = Ad @ total @ Ad.transpose(0, 2, 1) + C[starts + step]
             T, T_true = T @ T_step, T_true @ T_step @ np.stack([se3.exp(error) for error in pairs.errors[starts + step]])
         errors += [se3.log(se3.inverse(one) @ true) for one, true in zip(T, T_true, strict=True)]
