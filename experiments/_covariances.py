@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
+from _members import Solved
 from _uncertainty import LIMITS
 from scipy.stats import multivariate_t, norm
 from scipy.stats import t as student_t
@@ -55,21 +56,52 @@ class Said(NamedTuple):
         return np.sqrt(np.mean(np.diagonal(self.covariances, axis1=1, axis2=2) / LIMITS**2, axis=1))
 
 
-Method = Callable[[Pairs], Said]
+Method = Callable[[Solved], Said]
 
 
-def methods(model: Model, seen: Pairs) -> dict[str, Method]:
-    """All of them, fitted on these pairs, of which none is lost; the default comes as the weights have it."""
-    found: dict[str, Method] = {"evidence": lambda pairs: Said(raw(pairs))}
+def methods(model: Model, seen: Pairs, members: list[Model], by_members: Solved) -> dict[str, Method]:
+    """All of them, fitted on these pairs, lost ones apart; the default comes as the weights have it.
+
+    Args:
+        model: weights that are asked about.
+        seen: pairs to fit on.
+        members: networks of an ensemble; none: it is left out.
+        by_members: pairs to fit those on.
+    """
+    seen = seen.rows(np.flatnonzero(~seen.lost(model)))
+    by_members = by_members.rows(np.flatnonzero(~by_members.pairs.lost(model)))
+    found: dict[str, Method] = {"evidence": lambda solved: Said(raw(solved.pairs))}
     for name, formula, start in (("evidence, rescaled", rescaled, np.repeat([0.0, 1.0], 6)), ("information", of_information, np.zeros(8))):
-        found[name] = _with_numbers(formula, fitted(formula, start, seen))
+        found[name] = _with_numbers(formula, fitted(formula, start, seen, raw(seen)))
     weights = fit(model, seen, likelihood=spread.student_negative_log_likelihood, more={"freedom": jnp.array(1.0)})
     nu = float(spread.freedom(weights))
     print(f"Student: {nu:.2f} degrees of freedom")
-    found["Student"] = lambda pairs: Said(nu / (nu - 2.0) * squares(halves(model, weights, pairs)), nu)
+    found["Student"] = lambda solved: Said(nu / (nu - 2.0) * squares(halves(model, weights, solved.pairs)), nu)
     heads = ensemble(model, seen)
-    found[f"ensemble of {NUM_HEADS} heads"] = lambda pairs: Said(np.mean([squares(halves(model, head, pairs)) for head in heads], axis=0))
-    return found | {FULL: lambda pairs: Said(squares(halves(model, model.variables["covariance"], pairs)))}
+    found[f"ensemble of {NUM_HEADS} heads"] = lambda solved: Said(
+        np.mean([squares(halves(model, head, solved.pairs)) for head in heads], axis=0)
+    )
+    if members:
+        found[f"ensemble of {len(members)} networks"] = of_networks(members, by_members)
+    return found | {FULL: lambda solved: Said(squares(halves(model, model.variables["covariance"], solved.pairs)))}
+
+
+def of_networks(members: list[Model], seen: Solved) -> Method:
+    """A mixture of the members' Gaussians (Lakshminarayanan et al., NeurIPS 2017), its second moment about the pose that is asked about.
+
+    Each member's covariance is of a head fitted on its own pairs; six factors on the mixture's axes make the errors most likely.
+    """
+    heads = [fit(member, pairs) for member, pairs in zip(members, seen.members, strict=True)]
+
+    def mixture(solved: Solved) -> np.ndarray:
+        moments = []
+        for member, head, pairs in zip(members, heads, solved.members, strict=True):
+            away = se3.log(se3.inverse(solved.pairs.Ts_target_source) @ pairs.Ts_target_source)
+            moments.append(squares(halves(member, head, pairs)) + away[:, :, None] * away[:, None, :])
+        return np.mean(moments, axis=0)
+
+    factors = np.exp(fitted(stretched, np.zeros(6), seen.pairs, mixture(seen)))
+    return lambda solved: Said(factors[:, None] * mixture(solved) * factors[None, :])
 
 
 def ensemble(model: Model, seen: Pairs) -> list[spread.Weights]:
@@ -93,13 +125,18 @@ def raw(pairs: Pairs) -> np.ndarray:
     return np.stack([covariance.from_evidence(*nig).covariance for nig in numbers])
 
 
-def rescaled(free, pairs: Pairs, evidence) -> jax.Array:
+def rescaled(free, pairs: Pairs, C) -> jax.Array:
     """Of the evidence, each sigma to a power and times a factor."""
-    sigmas = jnp.sqrt(jnp.diagonal(evidence, axis1=1, axis2=2)) / UNITS[None]
+    sigmas = jnp.sqrt(jnp.diagonal(C, axis1=1, axis2=2)) / UNITS[None]
     return jax.vmap(jnp.diag)((jnp.exp(free[None, :6]) * UNITS[None] * sigmas ** free[None, 6:]) ** 2)
 
 
-def of_information(free, pairs: Pairs, evidence) -> jax.Array:
+def stretched(free, pairs: Pairs, C) -> jax.Array:
+    """A factor on each axis."""
+    return jnp.exp(free)[None, :, None] * C * jnp.exp(free)[None, None, :]
+
+
+def of_information(free, pairs: Pairs, C) -> jax.Array:
     """Inverse of the information, scaled, plus a variance per axis."""
     lever = jnp.asarray(np.repeat([1.0 / 15.0, 1.0], 3), jnp.float32)
     scaled = pairs.information * lever[None, :, None] * lever[None, None, :] + 1e-4 * jnp.eye(6)[None]
@@ -108,12 +145,12 @@ def of_information(free, pairs: Pairs, evidence) -> jax.Array:
     return jnp.linalg.inv(scaled) * size[None, :, None] * size[None, None, :] + floors[None]
 
 
-def fitted(formula: Callable, start: np.ndarray, pairs: Pairs) -> np.ndarray:
-    """Numbers that make the errors most likely."""
-    evidence, errors, rows = jnp.asarray(raw(pairs), jnp.float32), jnp.asarray(pairs.errors / UNITS, jnp.float32), _float32(pairs)
+def fitted(formula: Callable, start: np.ndarray, pairs: Pairs, C: np.ndarray) -> np.ndarray:
+    """Numbers that make the errors most likely under a formula of pairs and covariances."""
+    given, errors, rows = jnp.asarray(C, jnp.float32), jnp.asarray(pairs.errors / UNITS, jnp.float32), _float32(pairs)
 
     def loss(free, _):
-        C = formula(free, rows, evidence) / (UNITS[:, None] * UNITS[None, :])[None]
+        C = formula(free, rows, given) / (UNITS[:, None] * UNITS[None, :])[None]
         L = jnp.linalg.cholesky(C)
         white = jax.scipy.linalg.solve_triangular(L, errors[:, :, None], lower=True)[..., 0]
         log_det = jnp.sum(jnp.log(jnp.diagonal(L, axis1=1, axis2=2)), axis=1)
@@ -125,7 +162,9 @@ def fitted(formula: Callable, start: np.ndarray, pairs: Pairs) -> np.ndarray:
 
 def _with_numbers(formula: Callable, free: np.ndarray) -> Method:
     numbers = jnp.asarray(free)
-    return lambda pairs: Said(np.asarray(formula(numbers, _float32(pairs), jnp.asarray(raw(pairs), jnp.float32)), np.float64))
+    return lambda solved: Said(
+        np.asarray(formula(numbers, _float32(solved.pairs), jnp.asarray(raw(solved.pairs), jnp.float32)), np.float64)
+    )
 
 
 def _float32(pairs: Pairs) -> Pairs:

@@ -10,6 +10,8 @@ for the area under the ROC curve, which says whether the sigmas tell pairs that 
 - full: `ops.spread`, a Cholesky factor in the frame of the motion, from the solver's statistics and the evidence; the default.
 - Student: the same head under a multivariate Student-t likelihood, its degrees of freedom fitted too; its intervals are those of t.
 - ensemble of 5 heads: mean covariance of five such heads, each fitted on a bootstrap sample of the worlds; their mean is the same pose.
+- ensemble of 3 networks: members trained on from the weights, each on 120 worlds of its own; the second moment, about the default's pose,
+  of the mixture of their Gaussians, six factors fitted. Member heads and factors are fitted on the first 100 of the worlds.
 
 Only `full` has had its last scales set on folds. The default in bins of speed, turn rate and overlap (share of the source points that have
 a target point within 1 m at the true pose, of the preprocessed scans).
@@ -18,8 +20,8 @@ Then drives, pair after pair, each de-skewed by its own motion: unseen simulated
 (`--drives`). Squared errors over 10 and 100 frames are those of the pairs in a row, their covariances added up as if independent. The
 noise of the truth of recorded pairs (`real_calibration.py` says how it is measured) is added over 1 frame; over more it is not known.
 
-Run:     python experiments/calibration.py --drives raw_0926_0013 odo_04_000 --data TREE     (about 20 minutes on 2 cores after
-         `delo calibrate`, which leaves its solved pairs; figures go to its folder)
+Run:     python experiments/calibration.py --drives raw_0926_0013 odo_04_000 --data TREE     (about an hour on 2 cores after
+         `delo calibrate`, which leaves its solved pairs, 25 minutes with --members 0; members and figures go to its folder)
 Expect:  all bounds kept.
 """
 
@@ -30,6 +32,7 @@ import _harness
 import numpy as np
 from _covariances import FULL, UNITS, Method, Said, methods, over_frames, sparsifications
 from _harness import Row
+from _members import QUICK, Budget, Solved, trained
 from _peers import Drive, recorded, simulated
 from _truth import noise_header, truth_noise
 from _uncertainty import LIMITS, deskewed, prepared_sweep, relative
@@ -51,6 +54,7 @@ from delo_jax.uncertainty.observability import AXES
 
 UNSEEN_SEED, DRIVE_SEED = 1_600_000, 1_720_000
 NUM_UNSEEN, NUM_FITTED, NUM_QUICK = 300, 900, 4
+NUM_MEMBERS, NUM_MEMBERS_FITTED = 3, 100
 NUM_DRIVES, NUM_SCANS, NUM_QUICK_SCANS = 6, 121, 13
 STEPS = (10, 100)  # frames, of pairs in a row
 LEVELS = (0.5, 0.68, 0.9, 0.95, 0.99)
@@ -63,6 +67,18 @@ BINS = {  # edges
 }
 NEAR_M = 1.0
 FRAME_S = 1e-9 * FRAME_PERIOD_NS
+
+
+def solve(name: str, models: list[Model], folder: Path, count: int, seed: int, bar: Progress) -> list[Pairs]:
+    """The pairs of some worlds by each of the networks."""
+    found = []
+    for number, model in enumerate(models):
+        task = bar.add_task(f"{name} worlds" + (f", member {number}" if number else ""), total=count)
+        found.append(stored_pairs(folder, name, model, count, seed, on_world=functools.partial(bar.advance, task)))
+        print(
+            f"{name} worlds: {len(found[-1].errors)} pairs, {found[-1].lost(model).sum()} lost" + (f" by member {number}" if number else "")
+        )
+    return found
 
 
 def show(title: str, pairs: Pairs, by_method: dict[str, Said], more: dict[str, dict[str, str]] | None = None) -> None:
@@ -88,12 +104,12 @@ def show(title: str, pairs: Pairs, by_method: dict[str, Said], more: dict[str, d
             print(f"| {name} | {100 * level:.0f} % | {cells} |")
 
 
-def detection(pairs: Pairs, found: dict[str, Method]) -> dict[str, str]:
+def detection(solved: Solved, found: dict[str, Method]) -> dict[str, str]:
     """Area under the ROC curve of each method's sigmas, for pairs that are off; all pairs count."""
-    sizes = np.stack([np.linalg.norm(pairs.errors[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))], axis=1)
+    sizes = np.stack([np.linalg.norm(solved.pairs.errors[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))], axis=1)
     off = np.any(sizes > LIMITS[[0, 3]], axis=1)
     print(f"{off.sum()} of {len(off)} unseen pairs are off by more than {LIMITS[3]:g} m or {np.degrees(LIMITS[0]):.0f} deg")
-    return {name: f"{auroc(method(pairs).sizes(), off):.3f}" for name, method in found.items()}
+    return {name: f"{auroc(method(solved).sizes(), off):.3f}" for name, method in found.items()}
 
 
 def conditions(model: Model, folder: Path, count: int, bar: Progress) -> dict[str, np.ndarray]:
@@ -142,14 +158,16 @@ def in_a_row(model: Model, drives: list[Drive], bar: Progress) -> Pairs:
     return joined(rows)
 
 
-def show_drives(title: str, model: Model, pairs: Pairs, found: dict[str, Method], noise: np.ndarray) -> None:
+def show_drives(title: str, models: list[Model], drives: list[Drive], found: dict[str, Method], noise: np.ndarray, bar: Progress) -> None:
     """The table of pairs in a row, noise of the truth (6,) added over one frame; ends where a pair is lost."""
-    lost = pairs.lost(model)
+    pairs, *others = [in_a_row(model, drives, bar) for model in models]
+    lost = pairs.lost(models[0])
     if lost.any():
         print(f"\n{title}: {lost.sum()} of {len(lost)} pairs are lost and in no row")
-    good, columns = pairs.rows(np.flatnonzero(~lost)), {}
+    solved, columns = Solved(pairs, tuple(others)).rows(np.flatnonzero(~lost)), {}
+    good = solved.pairs
     pieces = good._replace(worlds=(np.cumsum(lost) * (1 + pairs.worlds.max()) + pairs.worlds)[~lost])
-    said = {name: method(good) for name, method in found.items()}
+    said = {name: method(solved) for name, method in found.items()}
     for num in STEPS:
         by_method = {name: over_frames(pieces, one.covariances, num) for name, one in said.items()}
         if len(by_method[FULL][0]):
@@ -190,6 +208,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = _harness.parser(__doc__, needs_data=False)
     parser.add_argument("--weights", default="delo-base", help="name or file, calibrated")
     parser.add_argument("--out", type=Path, default=Path("runs/calibrated"), help="folder of `delo calibrate`, for worlds and figures")
+    parser.add_argument("--members", type=int, default=NUM_MEMBERS, help="networks of an ensemble; 0: none is trained")
     parser.add_argument("--data", type=Path, help="tree of real sequences, for --drives")
     parser.add_argument("--drives", nargs="*", default=[], help="recorded ones, printed beside the simulated")
     args = parser.parse_args(argv)
@@ -197,16 +216,20 @@ def main(argv: list[str] | None = None) -> int:
         raise ConfigError("--data: expected the tree of the recorded drives, got none; name it, or leave --drives out")
     model, folder = delo_jax.load(args.weights), args.out / "worlds"
     num_unseen, num_fitted = (NUM_QUICK, NUM_QUICK) if args.quick else (NUM_UNSEEN, NUM_FITTED)
-    solved = {}
     with _harness.progress() as bar:
-        for name, seed, count in (("calibration", CALIBRATION_SEED, num_fitted), ("unseen", UNSEEN_SEED, num_unseen)):
-            step = functools.partial(bar.advance, bar.add_task(f"{name} worlds", total=count))
-            solved[name] = stored_pairs(folder, name, model, count, seed, on_world=step)
-            print(f"{name} worlds: {len(solved[name].errors)} pairs, {solved[name].lost(model).sum()} lost, which are left out")
-    seen, everything = solved["calibration"], solved["unseen"]
-    found, kept = methods(model, seen.rows(np.flatnonzero(~seen.lost(model)))), np.flatnonzero(~everything.lost(model))
-    unseen = everything.rows(kept)
-    said = {name: method(unseen) for name, method in found.items()}
+        members = trained(model, args.members, args.out / "members", bar, QUICK if args.quick else Budget())
+        (seen,) = solve("calibration", [model], folder, num_fitted, CALIBRATION_SEED, bar)
+        by_members, everything = (
+            Solved(rows[0], tuple(rows[1:]))
+            for rows in (
+                solve("calibration", [model, *members], folder, min(num_fitted, NUM_MEMBERS_FITTED), CALIBRATION_SEED, bar),
+                solve("unseen", [model, *members], folder, num_unseen, UNSEEN_SEED, bar),
+            )
+        )
+    found = methods(model, seen, members, by_members)
+    kept = np.flatnonzero(~everything.pairs.lost(model))
+    unseen = everything.pairs.rows(kept)
+    said = {name: method(everything.rows(kept)) for name, method in found.items()}
     show("Unseen worlds", unseen, said, {"AUROC": detection(everything, found)})
     for gap in GAPS:
         which = np.flatnonzero(np.abs(unseen.gaps) == gap)
@@ -216,13 +239,13 @@ def main(argv: list[str] | None = None) -> int:
         show_bins(unseen, values, said[FULL].covariances)
         num_drives, num_scans = (1, NUM_QUICK_SCANS) if args.quick else (NUM_DRIVES, NUM_SCANS)
         names = [(f"unseen drive {k}, {KINDS[k % len(KINDS)]}", DRIVE_SEED + k) for k in range(num_drives)]
-        pairs = in_a_row(model, [simulated(name, seed, num_scans, bar) for name, seed in names], bar)
-        show_drives("Unseen drives, pair after pair", model, pairs, found, np.zeros(6))
+        drives = [simulated(name, seed, num_scans, bar) for name, seed in names]
+        show_drives("Unseen drives, pair after pair", [model, *members], drives, found, np.zeros(6), bar)
         for name in args.drives:
             drive = recorded(args.data, name, num_scans if args.quick else None, bar)
             print(f"\n{noise_header()}")
             noise = truth_noise(drive, (1,), bar)[1].robust
-            show_drives(f"{name}, pair after pair", model, in_a_row(model, [drive], bar), found, noise)
+            show_drives(f"{name}, pair after pair", [model, *members], [drive], found, noise, bar)
     draw(args.out, unseen, said[FULL])
     rows = judge(unseen, said[FULL].covariances)
     return _harness.finish(rows, {"weights": args.weights, "unseen": num_unseen, "fitted": num_fitted, "drives": args.drives}, args)
