@@ -184,13 +184,7 @@ def run(sequence: Sequence, entries: dict[str, Entry], store: Path, bar: Progres
         bar: progress.
     """
     store.mkdir(parents=True, exist_ok=True)
-
-    def place(what: str, name: str = "", version: str = "") -> Path:
-        return store / f"{_digest([sequence.key, what, name, version, GAPS, NUM_PAIRS])}.npz"
-
-    poses = {name: place("poses", name, entry.version) for name, entry in entries.items() if entry.odometry is not None}
-    pairs = {name: place("pairs", name, entry.version) for name, entry in entries.items() if entry.pair is not None}
-    truth = place("truth")
+    poses, pairs, truth = _places(sequence, entries, store)
     new_poses, new_pairs = ([name for name, path in places.items() if not path.exists()] for places in (poses, pairs))
     if new_poses or new_pairs or not truth.exists():
         found = _one_pass(sequence, entries, new_poses, new_pairs, bar)
@@ -200,6 +194,23 @@ def run(sequence: Sequence, entries: dict[str, Entry], store: Path, bar: Progres
         write_arrays(truth, Ts=found.Ts_world_lidar)
     known = {name: Poses(**_load(path)) for name, path in poses.items()}
     return Results(_load(truth)["Ts"], known, {name: Pairs(**_load(path)) for name, path in pairs.items()})
+
+
+def is_stored(sequence: Sequence, entries: dict[str, Entry], store: Path) -> bool:
+    """Whether `run` has nothing to compute."""
+    poses, pairs, truth = _places(sequence, entries, store)
+    return all(path.exists() for path in (*poses.values(), *pairs.values(), truth))
+
+
+def _places(sequence: Sequence, entries: dict[str, Entry], store: Path) -> tuple[dict[str, Path], dict[str, Path], Path]:
+    """Files of the poses and pairs by method, and of the truth."""
+
+    def place(what: str, name: str = "", version: str = "") -> Path:
+        return store / f"{_digest([sequence.key, what, name, version, GAPS, NUM_PAIRS])}.npz"
+
+    poses = {name: place("poses", name, entry.version) for name, entry in entries.items() if entry.odometry is not None}
+    pairs = {name: place("pairs", name, entry.version) for name, entry in entries.items() if entry.pair is not None}
+    return poses, pairs, place("truth")
 
 
 def _load(path: Path) -> dict[str, np.ndarray]:

@@ -3,14 +3,15 @@
 Drives: path, heading, speed and body motions of the official poses, scans simulated as measured by an HDL-64E in a random world beside the
 path, with exact truth (no scan of KITTI is in them; `delo_jax.sim.simulate_route`). 04, 07 and 10 whole, the first 300 frames of the
 others; `--all` takes 00 to 10 whole. Recorded sequences with `poses_boresight` as truth. KITTI's metric over the lengths of 100 to 800 m
-that each reaches, 10 to 50 m on the recorded ones; two threads; every method sees every scan as it comes, taking turns at who is first.
+that each reaches, 10 to 50 m on the recorded ones; every method sees every scan as it comes, taking turns at who is first. `--jobs`
+sequences are under way at a time, one a core by default: times are those of methods on their share of the cores.
 
 Pairs at gaps of 1, 2, 3 and 5 frames, from the identity, as measured (no de-skew), 60 at even distances of each gap; a pair is lost when it
 is off by more than 0.5 m or 2 deg. Times hold the preparation of both scans.
 
 What a method made of a sequence is kept in `--out` by content (scans, method, version, settings): a re-run does what has changed.
 
-Run:     python experiments/benchmark.py --data TREE           (about 100 minutes on 2 cores; needs '.[baselines]')
+Run:     python experiments/benchmark.py --data TREE           (about an hour on 2 cores; needs '.[baselines]')
 Expect:  all bounds kept.
 """
 
@@ -22,8 +23,10 @@ from typing import NamedTuple
 
 import _harness
 import numpy as np
-from _benchmark import EXCERPT, GAPS, KINDS, OTHERS, OWN, WHOLE, Entry, Results, Sequence, real, run, simulated, source_hash
+from _benchmark import EXCERPT, GAPS, KINDS, OTHERS, OWN, WHOLE, Entry, Results, Sequence, is_stored, real, run, simulated, source_hash
 from _harness import Row
+from _workers import Counting, cores, spread
+from rich.progress import Progress
 
 import delo_jax
 from delo_jax import weights
@@ -151,6 +154,7 @@ def parse(argv: list[str] | None, doc: str | None = __doc__):
     parser.add_argument("--methods", nargs="*", default=list(METHODS), help="of `delo run --help`; all by default")
     parser.add_argument("--weights", nargs="*", default=[], metavar="METHOD=FILE", help="of networks that you trained: dcp, delo-paper")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"), help="store")
+    parser.add_argument("--jobs", type=int, default=len(cores()), help="sequences at a time, each with its share of the cores")
     args = parser.parse_args(argv)
     for given, known in ((args.methods, METHODS), (args.routes, KINDS)):
         if unknown := set(given) - set(known):
@@ -158,34 +162,48 @@ def parse(argv: list[str] | None, doc: str | None = __doc__):
     return args
 
 
-def sequences(args, bar, *, with_recorded: bool = True) -> tuple[list[Sequence], list[Sequence]]:
-    """Simulated and recorded ones."""
+def chosen(args) -> tuple[list[tuple[str, int | None]], list[tuple[str, None]]]:
+    """Simulated and recorded sequences, by name and number of scans, all scans where that is None."""
     if args.quick:
-        return [simulated(args.data, QUICK_ROUTE, num_scans=QUICK)], []
-    drives = [simulated(args.data, number, num_scans=None if args.all or number in WHOLE else EXCERPT) for number in args.routes]
-    return drives, [real(args.data, name, bar) for name in args.sequences if with_recorded]
+        return [(QUICK_ROUTE, QUICK)], []
+    return [(number, None if args.all or number in WHOLE else EXCERPT) for number in args.routes], [(name, None) for name in args.sequences]
+
+
+def opened(data: Path, name: str, num_scans: int | None, bar: Progress) -> Sequence:
+    """A simulated or a recorded one."""
+    return simulated(data, name, num_scans=num_scans) if name in KINDS else real(data, name, bar)
+
+
+def work(args, name: str, num_scans: int | None, methods: list[str]) -> None:
+    """What the methods make of a sequence, into the store; in a process of its own."""
+    found = entries(methods, delo_jax.load("delo-base"), _weights(args))
+    run(opened(args.data, name, num_scans, Progress(disable=True)), found, args.out, Counting())
+
+
+def _weights(args) -> dict[str, str]:
+    return dict(one.split("=", 1) for one in args.weights)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run what is missing, print, judge."""
     args = parse(argv)
-    params = delo_jax.load("delo-base")
-    methods = entries(args.methods, params, dict(one.split("=", 1) for one in args.weights))
+    methods = entries(args.methods, delo_jax.load("delo-base"), _weights(args))
+    results: list[list[Results]] = []
     with _harness.progress() as bar:
-        both = sequences(args, bar)
-        task = bar.add_task("sequences", total=sum(map(len, both)))
-        results: list[list[Results]] = []
+        both = [[(opened(args.data, *which, bar), which) for which in group] for group in chosen(args)]
+        missing = [(sequence.num_scans, which) for group in both for sequence, which in group if not is_stored(sequence, methods, args.out)]
+        if num := min(args.jobs, len(missing)):
+            names = [name for name in methods if name != NO_MAP]
+            tasks = [(args, *which, names) for _, which in sorted(missing, key=lambda one: -one[0])]
+            spread(work, tasks, num, bar, "scans", sum(num_scans for num_scans, _ in missing))
         for group in both:
-            results.append([])
-            for sequence in group:
-                results[-1].append(run(sequence, methods, args.out, bar))
-                bar.advance(task)
+            results.append([run(sequence, methods, args.out, bar) for sequence, _ in group])
     rows: list[Row] = []
     lengths = (SHORT_LENGTHS_M if args.quick else KITTI_LENGTHS_M), SHORT_LENGTHS_M
     titles = "Simulated drives along KITTI's motions", "Recorded sequences"
     for title, lengths_m, group, found in zip(titles, lengths, both, results, strict=True):
         tables = []
-        for sequence, result in zip(group, found, strict=True):
+        for (sequence, _), result in zip(group, found, strict=True):
             tables.append({name: numbers(result, name, lengths_m) for name in result.poses})
             way_m = np.linalg.norm(np.diff(result.Ts_world_lidar[:, :3, 3], axis=0), axis=1).sum()
             show_odometry(sequence, tables[-1], way_m)
@@ -194,7 +212,7 @@ def main(argv: list[str] | None = None) -> int:
             by_method = {name: [one.pairs[name] for one in found] for name in found[0].pairs}
             lost = show_pairs(f"{title}: pairs from the identity", by_method)
             rows = rows or judge(drifts, lost)
-    settings = {"routes": args.routes, "sequences": args.sequences, "all": args.all, "methods": list(methods)}
+    settings = {"routes": args.routes, "sequences": args.sequences, "all": args.all, "jobs": args.jobs, "methods": list(methods)}
     settings["versions"] = {name: version(name) for name in {METHODS[n].package for n in args.methods} if name is not None}
     return _harness.finish(rows, settings, args)
 

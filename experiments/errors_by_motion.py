@@ -110,7 +110,7 @@ def main(argv: list[str] | None = None) -> int:
     args = benchmark.parse(argv, __doc__)
     methods = benchmark.entries([name for name in args.methods if name in SHOWN], delo_jax.load("delo-base"), {})
     with _harness.progress() as bar:
-        drives, _ = benchmark.sequences(args, bar, with_recorded=False)
+        drives = [benchmark.opened(args.data, *which, bar) for which in benchmark.chosen(args)[0]]
         results = [run(sequence, methods, args.out, bar) for sequence in drives]
     names = [name for name in SHOWN if name in results[0].poses]
     kinds = {
