@@ -1,16 +1,14 @@
-"""The stream: real time on two cores, flat memory over 2,000 scans, the same bytes twice.
+"""The stream: real time on two cores, the same bytes twice.
 
-`delo run` on every real sequence, twice (reading and preprocessing included, compile time apart); then 2,000 simulated scans
-(HDL-64E with 450 columns, as measured) through one `LidarOdometry` while memory and compilations of the process are watched.
+`delo run` on every real sequence, twice (reading and preprocessing included, compile time apart). What a stream costs besides its
+frames, memory and compilation among it, is measured by `benchmarks/stream.py`.
 
-Run:     python experiments/streaming.py --data TREE        (about 10 minutes on 2 cores)
-Expect:  odo_04_000 at 10 scans/s or more; less than 20 MB growth and no compilation after the first 200 scans.
+Run:     python experiments/streaming.py --data TREE        (about 2 minutes on 2 cores)
+Expect:  odo_04_000 at 10 scans/s or more.
 """
 
 import csv
-import dataclasses
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -22,22 +20,11 @@ import numpy as np
 from _harness import Row
 
 import delo_jax
-from delo_jax import inference
 from delo_jax.data import camera_to_lidar, read_kitti_poses
-from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.metrics.ate import relative_errors
-from delo_jax.sim import SENSORS, simulate_drive
-from delo_jax.sim.drive import DRIVE_SEED
 
 SEQUENCES = ("odo_04_000", "raw_0926_0013", "odo_00_056")
 REAL_TIME = "odo_04_000"  # the bound is on this one
-NUM_SCANS, SETTLED = 2000, 200
-JITTED: tuple[Any, ...] = inference.encode, inference.solve, inference.fine_step, inference.robust_steps, inference.sweep_steps
-
-
-def resident_mb() -> float:
-    """Resident memory of this process [MB]; Linux."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def run(folder: Path, data: Path, name: str) -> dict[str, Any]:
@@ -75,36 +62,16 @@ def real(data: Path, name: str, work: Path) -> list[Row]:
     ]
 
 
-def memory(params, num_scans: int, bar) -> list[Row]:
-    """Growth of resident memory over a long simulated drive, simulator included, and what was compiled on the way."""
-    sensor = dataclasses.replace(SENSORS["hdl64e"], num_columns=450)
-    odometry, samples, compiled = delo_jax.LidarOdometry(params), [], []
-    task = bar.add_task("simulated scans", total=num_scans)
-    for k, scan in enumerate(simulate_drive("mixed", DRIVE_SEED + 7, num_scans, sensor, rolling_shutter=True)):
-        odometry.register(scan.points, k * FRAME_PERIOD_NS, scan.times_s)
-        samples.append(resident_mb())
-        compiled.append(sum(function._cache_size() for function in JITTED))
-        bar.advance(task)
-    settled = min(SETTLED, num_scans // 2)
-    growth = float(np.max(samples[-50:]) - np.max(samples[max(settled - 50, 0) : settled]))
-    poses_mb = 2e-3 * (num_scans - settled)  # what a trajectory keeps: about 2 kB a frame
-    return [
-        Row(f"memory growth after the first {settled} of {num_scans} scans, beyond the poses", growth - poses_mb, "MB", 20.0),
-        Row(f"compilations after the first {settled} of {num_scans} scans", float(compiled[-1] - compiled[settled - 1]), "", 0.0),
-    ]
-
-
 def main(argv: list[str] | None = None) -> int:
     """Measure, print, judge."""
     args = _harness.parser(__doc__, needs_data=True).parse_args(argv)
-    rows = []
+    names, rows = SEQUENCES[-1:] if args.quick else SEQUENCES, []
     with tempfile.TemporaryDirectory() as work, _harness.progress() as bar:
-        task = bar.add_task("real sequences", total=len(SEQUENCES))
-        for name in SEQUENCES:
+        task = bar.add_task("real sequences", total=len(names))
+        for name in names:
             rows += real(args.data, name, Path(work))
             bar.advance(task)
-        rows += memory(delo_jax.load("delo-base"), 60 if args.quick else NUM_SCANS, bar)
-    return _harness.finish(rows, {"sequences": SEQUENCES, "num_scans": NUM_SCANS}, args)
+    return _harness.finish(rows, {"sequences": names}, args)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """What commands show: progress on stderr, tables on stdout, Ctrl-C between two scans."""
 
+import itertools
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -7,7 +8,7 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.status import Status
 from rich.table import Table
 from rich.text import Text
@@ -50,6 +51,22 @@ def progress(unit: str = "scans") -> Progress:
 def working(what: str) -> Status:
     """A sign of life on stderr while something runs that has no steps to count; a context manager."""
     return Console(stderr=True).status(what)
+
+
+@contextmanager
+def parts(what: str, total: int) -> Iterator[Callable[[str], None]]:
+    """A bar over parts that take nobody knows how long, with the time so far; on stderr, and gone when they are done.
+
+    Yields what to call with the name of each part before it begins.
+    """
+    console = Console(stderr=True)
+    if not console.is_interactive:  # a bar that goes leaves nothing in a file
+        yield lambda part: None
+        return
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[note]}")
+    with Progress(*columns, console=console, redirect_stdout=sys.stdout.isatty(), transient=True) as bar:
+        task, number = bar.add_task(what, total=total, note=""), itertools.count()
+        yield lambda part: bar.update(task, completed=next(number), note=part, refresh=True)
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[int] = ()) -> None:

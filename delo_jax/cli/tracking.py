@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -20,16 +20,19 @@ import delo_jax
 from delo_jax.cli.command import Command
 from delo_jax.cli.console import interruptible, progress
 from delo_jax.cli.method import Opened, open_method, package_versions
-from delo_jax.cli.refinement import Refinement, refine, write
 from delo_jax.config import DeloConfig, to_toml
 from delo_jax.data.fields import RawScan
 from delo_jax.errors import ConfigError, DeloError, ScanError
+from delo_jax.inference import PreparedScan
+from delo_jax.model.delo import Model
 from delo_jax.pipeline.baseline_odometry import BaselineOdometry
 from delo_jax.pipeline.lidar_odometry import Frame, LidarOdometry
 from delo_jax.pipeline.trajectory import RunWriter, Trajectory
-from delo_jax.refine.refiner import Refiner, Tracked
 from delo_jax.report.cloud import DriveCloud
-from delo_jax.report.figures import trajectory_figure
+
+if TYPE_CHECKING:  # graphs and figures are imported when they are made: the first pose does not wait for them
+    from delo_jax.cli.refinement import Refinement
+    from delo_jax.refine.refiner import Refiner, Tracked
 
 STAGES = ("prepare", "solve", "insert")
 
@@ -95,7 +98,7 @@ class Result(NamedTuple):
     interrupted: bool
     truth: np.ndarray | None
     """Of the frames that were tracked."""
-    refinement: Refinement | None
+    refinement: "Refinement | None"
     cloud: DriveCloud
     """What the scans saw, thinned."""
 
@@ -138,7 +141,7 @@ def track(job: Job) -> Result:
         writer = RunWriter(job.folder, T_cam_lidar=job.source.T_cam_lidar, timing_names=(job.stage, *STAGES))
     except OSError as error:
         raise ConfigError(f"--out {job.folder}: expected a folder to write to, got {error.strerror}; choose another") from error
-    refiner, cloud = Refiner(params) if job.refine and params is not None else None, DriveCloud()
+    refiner, cloud = _refiner(params) if job.refine and params is not None else None, DriveCloud()
     try:
         with writer:
             acquired, interrupted = _loop(job, odometry, writer, refiner, cloud)
@@ -150,10 +153,18 @@ def track(job: Job) -> Result:
             refiner.stop()
 
 
-def _refined(job: Job, refiner: Refiner | None, trajectory: Trajectory) -> Refinement | None:
+def _refiner(params: Model) -> "Refiner":
+    from delo_jax.refine.refiner import Refiner
+
+    return Refiner(params)
+
+
+def _refined(job: Job, refiner: "Refiner | None", trajectory: Trajectory) -> "Refinement | None":
     """The pose graph of the run, written to its folder; where it fails, a sentence: the odometry stands without it."""
     if refiner is None or len(trajectory) < 2:
         return None
+    from delo_jax.cli.refinement import refine, write
+
     try:
         found = refine(refiner.close(), refiner.Ts_world_lidar)
     except DeloError as error:
@@ -164,7 +175,7 @@ def _refined(job: Job, refiner: Refiner | None, trajectory: Trajectory) -> Refin
 
 
 def _loop(
-    job: Job, odometry: LidarOdometry | BaselineOdometry, writer: RunWriter, refiner: Refiner | None, cloud: DriveCloud
+    job: Job, odometry: LidarOdometry | BaselineOdometry, writer: RunWriter, refiner: "Refiner | None", cloud: DriveCloud
 ) -> tuple[list[float], bool]:
     """All frames; the seconds it took to get each scan, and whether Ctrl-C ended it."""
     acquired: list[float] = []
@@ -181,11 +192,17 @@ def _loop(
             frame = _register(odometry, scan, stamp_ns)
             writer.append(frame._replace(timing={job.stage: acquired[-1], **frame.timing}))
             if refiner is not None and isinstance(odometry, LidarOdometry):
-                refiner.add(Tracked(frame.since, frame.T_world_lidar, frame.covariance, frame.local, odometry.last_scan))
+                refiner.add(_tracked(frame, odometry.last_scan))
             if frame.status != "rejected" and not isinstance(scan, str):
                 cloud.add_scan(index, frame.T_world_lidar, getattr(odometry, "last_scan", None) or scan)  # not every method keeps it
             bar.advance(task)
     return acquired, False
+
+
+def _tracked(frame: Frame, scan: PreparedScan | None) -> "Tracked":
+    from delo_jax.refine.refiner import Tracked
+
+    return Tracked(frame.since, frame.T_world_lidar, frame.covariance, frame.local, scan)
 
 
 def _acquire(source: Scans, index: int) -> RawScan | str:
@@ -227,6 +244,8 @@ def _finish(job: Job, result: Result, facts: dict[str, Any]) -> None:
     write_json(job.folder / "run.json", facts | {"state": state, "frames": counts, "timing_ms": timing})
     if len(trajectory):
         known = bool(np.isfinite(trajectory.confidences).any())  # NaN of a method without uncertainty
+        from delo_jax.report.figures import trajectory_figure
+
         trajectory_figure(
             job.folder / "trajectory.png",
             trajectory.Ts_world_lidar,

@@ -120,6 +120,15 @@ def test_interrupted_anywhere(monkeypatch, cli):
     assert cli("doctor") == (1, "", "delo: interrupted\n")
 
 
+def test_the_first_pose_waits_for_neither_figures_nor_graphs():
+    """Oracle: the interpreter's own list of what is imported, in a process that has everything before the first scan."""
+    code = "import sys, delo_jax.baselines.registry, delo_jax.cli.tracking, delo_jax.data.dataset; print(*sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = {name.split(".")[0] for name in run.stdout.split()}
+    assert "jax" in loaded
+    assert not {"gtsam", "matplotlib", "optimistix", "orbax"} & loaded
+
+
 def test_compiled_code_is_kept_for_the_next_start(monkeypatch, tmp_path):
     """Oracle: JAX's own variables, in the user's cache folder; those that are set stand, and no folder is no error."""
     for name in ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):

@@ -2,6 +2,7 @@ import csv
 import hashlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -181,6 +182,17 @@ def test_what_is_printed(tree, cli, tmp_path):
     for words in ("scans/s", " cm ", " deg ", " ms ", "whole scan, p50 / p95", f"ok {NUM_SCANS}", "path below 10 m"):
         assert words in done.out
     assert f"{NUM_SCANS}/{NUM_SCANS}" in done.err  # the bar
+
+
+def test_compiling_shows_how_far_it_is(tree, cli, monkeypatch, tmp_path):
+    """Oracle: on a terminal, which FORCE_COLOR stands for, every part by name and number, and the time; in a file nothing."""
+    arguments = "run", tree, "--sequence", NAME, "--out"
+    assert "compiling" not in cli(*arguments, tmp_path / "file").err
+    for name, value in {"FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "120"}.items():
+        monkeypatch.setenv(name, value)
+    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", cli(*arguments, tmp_path / "terminal").err)
+    for number, part in enumerate(("encoder", "solver", "steps on the map")):
+        assert re.search(rf"compiling .* {number}/3 0:00:\d\d {part}", shown)
 
 
 def test_a_folder_with_a_run_is_left_alone(folder, tree, cli):
