@@ -10,7 +10,7 @@ threads of the one before fall asleep.
   Ratios there are medians over the turns.
 
 Run:     python benchmarks/peers.py [--data TREE --sequence NAME]     (about 12 minutes on 2 cores; needs '.[baselines,parity]')
-Expect:  all bars kept on an idle machine; 1 when one is missed. --quick says nothing of them.
+Expect:  all bounds kept on an idle machine.
 """
 
 import argparse
@@ -18,27 +18,25 @@ import os
 import platform
 import sys
 import tempfile
-from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # read as packages load, like the numbers of threads
 os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "2"  # as `NUM_THREADS` says
 
-import _bars
+sys.path.append(str(Path(__file__).parents[1] / "experiments"))
+
+import _harness
 import _peers_drive as drives
 import _peers_networks as networks
 import _peers_turns as turns
-from _bars import Bar
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from _harness import Row
+from rich.progress import Progress
 
 import delo_jax
 from delo_jax.baselines.protocols import NUM_THREADS
-from delo_jax.bench.suite import device_line
-from delo_jax.bench.timing import Timing
-from delo_jax.errors import DeloError
+from delo_jax.bench.timing import UNKNOWN, Timing
 
 PARTS = ("networks", "drive", "paper")
 MOST_MS = {networks.BASE: 25.0, networks.TINY_WIDE: 10.0, networks.TINY: 10.0}
@@ -72,14 +70,14 @@ def pin() -> list[int]:
 
 
 def machine(cores: list[int]) -> str:
-    """Device, threads and versions."""
+    """Processor, threads and versions of the peers."""
     model = platform.processor() or platform.machine()
     if (info := Path("/proc/cpuinfo")).exists():
         names = [line.split(":", 1)[1].strip() for line in info.read_text(encoding="utf-8").splitlines() if line.startswith("model name")]
         model = names[0] if names else model
     peers = ", ".join(f"{name} {_version(name)}" for name in ("torch", "kiss-icp", "small_gicp", "kiss-matcher", "numpy"))
     pinned = f"pinned to cores {cores}" if cores else "not pinned: this system has no affinity"
-    return f"{model}; {device_line()}; {peers}; {NUM_THREADS} threads for all, {pinned}"
+    return f"{model}; {peers}; {NUM_THREADS} threads for all, {pinned}"
 
 
 def _version(name: str) -> str:
@@ -94,23 +92,24 @@ def load() -> str:
     return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "not known"
 
 
-def network_bars(found: dict[str, Timing]) -> list[Bar]:
+def network_rows(found: dict[str, Timing]) -> list[Row]:
     """Of the presets alone."""
-    bars = [Bar(f"network alone, {name}: p50", found[name].percentile(50), "ms", MOST_MS[name]) for name in MOST_MS if name in found]
+    rows = [Row(f"network alone, {name}: p50", found[name].percentile(50), "ms", MOST_MS[name]) for name in MOST_MS if name in found]
     if networks.BASE in found:
         base = found[networks.BASE]
-        bars.append(Bar(f"network alone, {networks.BASE}: p95 / p50", base.percentile(95) / base.percentile(50), bound=SPREAD))
-    return bars
+        rows.append(Row(f"network alone, {networks.BASE}: p95 / p50", base.percentile(95) / base.percentile(50), "ratio", SPREAD))
+    return rows
 
 
-def drive_bars(found: dict[str, Timing]) -> list[Bar]:
+def drive_rows(found: dict[str, Timing]) -> list[Row]:
     """Of `delo run`, and beside each peer."""
     ours, bounds = found[drives.OURS], {50: P50_TO_KISS, 95: P95_TO_KISS}
     return [
-        Bar(
+        Row(
             f"{drives.OURS} / {name}: p{percent}",
             ours.percentile(percent) / timing.percentile(percent),
-            bound=bounds[percent] if name == drives.KISS else None,
+            "ratio",
+            bounds[percent] if name == drives.KISS else None,
         )
         for name, timing in found.items()
         if name in drives.PEERS
@@ -118,8 +117,8 @@ def drive_bars(found: dict[str, Timing]) -> list[Bar]:
     ]
 
 
-def paper_bars(found: networks.PaperSize) -> tuple[list[Bar], list[str]]:
-    """Of the network at paper size; and the names of those that want PyTorch, where there is none."""
+def paper_rows(found: networks.PaperSize) -> list[Row]:
+    """Of the network at paper size; what wants PyTorch, where there is none, is not known, and so missed."""
     n, by, same = networks, found.timings, "both softmax networks: largest difference of the"
     over = [
         (n.SOFTMAX, n.TORCH_SOFTMAX, TO_SOFTMAX, False),
@@ -127,14 +126,12 @@ def paper_bars(found: networks.PaperSize) -> tuple[list[Bar], list[str]]:
         (n.TORCH_SCALED, n.TRANSPORT, None, True),
         (n.TRANSPORT, n.STREAMING, OVER_WHOLE, True),
     ]
-    bars = [
-        Bar(f"{above} / {below}", turns.paired_ratio(by[above], by[below]), bound=bound, at_least=at_least)
-        for above, below, bound, at_least in over
-        if {above, below} <= set(by)
-    ]
-    if n.TORCH_SOFTMAX in by:
-        bars += [Bar(f"{same} translation", found.apart_m, "m", SAME_M), Bar(f"{same} rotation matrix", found.apart_rad, "", SAME_RAD)]
-    return bars, [f"{above} / {below}" for above, below, bound, _ in over if bound is not None and not {above, below} <= set(by)]
+    rows = []
+    for above, below, bound, at_least in over:
+        ratio = turns.paired_ratio(by[above], by[below]) if {above, below} <= set(by) else UNKNOWN
+        rows.append(Row(f"{above} / {below}", ratio, "ratio", bound, at_least))
+    rows.append(Row(f"{same} translation", found.apart_m, "m", SAME_M))
+    return [*rows, Row(f"{same} rotation matrix", found.apart_rad, "", SAME_RAD)]
 
 
 def take_drive(args: argparse.Namespace, num_scans: int, bar: Progress) -> drives.Drive:
@@ -147,7 +144,7 @@ def take_drive(args: argparse.Namespace, num_scans: int, bar: Progress) -> drive
     return drives.recorded(args.data, args.sequence, num_scans, advance) if args.data else drives.simulated(num_scans, advance)
 
 
-def run_drive(drive: drives.Drive, settings: Settings, bar: Progress) -> list[Bar]:
+def run_drive(drive: drives.Drive, settings: Settings, bar: Progress) -> list[Row]:
     """Times all odometries and prints them."""
     task = bar.add_task("drive", total=len(drive.sweeps))
     with tempfile.TemporaryDirectory() as folder:
@@ -156,68 +153,48 @@ def run_drive(drive: drives.Drive, settings: Settings, bar: Progress) -> list[Ba
         drives.close(methods)
     errors = drives.step_errors(drive, poses, settings.warm_up)
     print("\n" + turns.table(drive.name, found, errors, "error of a step, median / largest cm"), flush=True)
-    return drive_bars(found)
+    return drive_rows(found)
 
 
-def measured(parts: list[str], drive: drives.Drive, settings: Settings, bar: Progress, *, quick: bool) -> tuple[list[Bar], list[str]]:
-    """All bars, and what could not be measured."""
-    bars, left_out, pairs = list[Bar](), list[str](), drives.pairs(drive, settings.num_pairs)
+def measured(parts: list[str], drive: drives.Drive, settings: Settings, bar: Progress, *, quick: bool) -> list[Row]:
+    """All rows."""
+    rows, pairs = list[Row](), drives.pairs(drive, settings.num_pairs)
     if "networks" in parts:
         found = networks.time_presets(pairs, settings.num_calls, settings.warm_up, small=quick)
         print("\n" + turns.table("network alone", found), flush=True)
-        bars += network_bars(found)
+        rows += network_rows(found)
     if "paper" in parts:
         paper = networks.time_paper(pairs, settings.num_paper, settings.warm_up_paper)
         print("\n" + turns.table("paper size, N = 1024, D = 512", paper.timings), flush=True)
-        more, left_out = paper_bars(paper)
-        bars += more
-        if left_out:
-            print(f"\n{networks.torch_missing()}; left out: {'; '.join(left_out)}", flush=True)
+        rows += paper_rows(paper)
+        if missing := networks.torch_missing():
+            print(f"\n{missing}", flush=True)
     if "drive" in parts:
-        bars += run_drive(drive, settings, bar)
-    return bars, left_out
+        rows += run_drive(drive, settings, bar)
+    return rows
 
 
-def parser() -> argparse.ArgumentParser:
+def parse(argv: list[str] | None) -> argparse.Namespace:
     """Options."""
-    result = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    result.add_argument("--quick", action="store_true", help="few scans and calls, prints the tables, no verdict")
-    result.add_argument(
-        "--parts", nargs="+", choices=PARTS, default=list(PARTS), help="what is measured; bars of other parts are not judged"
-    )
-    result.add_argument("--data", type=Path, help="tree of recorded sequences; a simulated drive by default")
-    result.add_argument("--sequence", default="odo_00_056", help="of that tree")
-    result.add_argument("--json", type=Path, help="also write bars and versions here")
-    return result
+    parser = _harness.parser(__doc__, needs_data=False)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="what is measured; other bounds are not judged")
+    parser.add_argument("--data", type=Path, help="tree of recorded sequences; a simulated drive by default")
+    parser.add_argument("--sequence", default="odo_00_056", help="of that tree")
+    return parser.parse_args(argv)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Measure, print, judge."""
-    args = parser().parse_args(argv)
+    args = parse(argv)
     settings, about, before = QUICK if args.quick else Settings(), machine(pin()), load()
     print(f"{about}; load {before}", flush=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     num_scans = settings.num_scans if "drive" in args.parts else 2 * settings.num_pairs
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with _harness.progress() as bar:
         drive = take_drive(args, num_scans, bar)
-        bars, left_out = measured(args.parts, drive, settings, bar, quick=args.quick)
-    print("\n" + _bars.table(bars, quick=args.quick))
-    words = _bars.verdict(bars, left_out, quick=args.quick)
-    print(f"\n{about}; load {before} before, {load()} after; {words}")
-    if args.json:
-        facts: dict[str, Any] = {"device": about, "quick": args.quick, "parts": args.parts, "drive": drive.name, "left_out": left_out}
-        _bars.write(args.json, bars, facts | {"settings": settings._asdict()})
-    return _bars.exit_code(bars, left_out, quick=args.quick)
-
-
-def run(call: Callable[[], int]) -> int:
-    """The exit code; a missing package or wrong input ends the script with its sentence, not with a traceback."""
-    try:
-        return call()
-    except DeloError as error:
-        print(error, file=sys.stderr)
-        return 1
+        rows = measured(args.parts, drive, settings, bar, quick=args.quick)
+    print(f"\n{about}; load {before} before, {load()} after")
+    return _harness.finish(rows, settings._asdict() | {"parts": args.parts, "drive": drive.name, "machine": about}, args)
 
 
 if __name__ == "__main__":
-    sys.exit(run(main))
+    _harness.run(main)

@@ -1,7 +1,6 @@
-"""The benchmark beside other packages: who is timed when, what a bar says, the authors' transport, and the whole on small sizes."""
+"""The benchmark beside other packages: who is timed when, the authors' transport, and the whole on small sizes."""
 
 import json
-import math
 import subprocess
 import sys
 from pathlib import Path
@@ -14,11 +13,9 @@ from delo_jax.bench.timing import NOT_BUILT, Timing
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts import their neighbours
 
-import _bars  # noqa: E402
 import _peers_drive  # noqa: E402
 import _peers_networks  # noqa: E402
 import _peers_turns as turns  # noqa: E402
-from _bars import Bar  # noqa: E402
 
 
 class Clock:
@@ -62,28 +59,6 @@ def test_a_ratio_of_turns_forgets_one_that_was_disturbed():
     """Oracle: by hand; the ratios are 2, 5 and 2, while those of the medians are 5 and 1."""
     below, above = (Timing(NOT_BUILT, 0.0, values) for values in ((1.0, 1.0, 3.0), (2.0, 5.0, 6.0)))
     assert turns.paired_ratio(above, below) == 2.0
-
-
-@pytest.mark.parametrize(
-    ("bar", "ok"),
-    [
-        (Bar("most", 1.0, bound=1.0), True),
-        (Bar("most", 1.01, bound=1.0), False),
-        (Bar("least", 1.4, bound=1.5, at_least=True), False),
-        (Bar("least", 1.5, bound=1.5, at_least=True), True),
-        (Bar("not measured", math.nan, bound=1.5, at_least=True), False),
-        (Bar("printed", 99.0), True),
-    ],
-)
-def test_a_missed_bar_ends_in_1(bar, ok):
-    """Oracle: the meaning of a bound, case by case; a quick run never judges, and what could not be measured is missed."""
-    assert bar.ok == ok
-    assert _bars.exit_code([bar], [], quick=False) == (0 if ok else 1)
-    assert _bars.exit_code([bar], ["PyTorch"], quick=False) == 1
-    assert _bars.exit_code([bar], ["PyTorch"], quick=True) == 0
-    cells = _bars.table([bar], quick=False).splitlines()[-1]
-    assert ("NO" in cells) == (not ok)
-    assert "NO" not in _bars.table([bar], quick=True)
 
 
 def test_dense_products_are_the_loop_that_scales_rows_and_columns():
@@ -131,12 +106,12 @@ def test_a_quick_run(tmp_path, part):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "quick run, no verdict" in done.stdout
-    bars = {bar["what"]: bar for bar in json.loads(record.read_text())["bars"]}
+    rows = {row["metric"]: row for row in json.loads(record.read_text())["rows"]}
     expected = {
         "networks": ["network alone, tiny, N = 256 (its own): p50"],
         "paper": ["JAX, softmax head / PyTorch, softmax head", "both softmax networks: largest difference of the translation"],
         "drive": [f"delo run / {name}: p{percent}" for name in _peers_drive.PEERS for percent in (50, 95)],
     }
-    assert set(expected[part]) <= set(bars)
-    assert all(bar["value"] >= 0 for bar in bars.values())
-    assert all(bar["ok"] for what, bar in bars.items() if "largest difference" in what)
+    assert set(expected[part]) <= set(rows)
+    assert all(row["value"] >= 0 for row in rows.values())
+    assert all(row["ok"] for metric, row in rows.items() if "largest difference" in metric)
