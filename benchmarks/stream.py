@@ -38,7 +38,6 @@ import _harness
 from _harness import Row
 
 import delo_jax
-from delo_jax.cli.method import compile_model
 from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.sim import SENSORS, simulate_drive
 from delo_jax.sim.drive import DRIVE_SEED
@@ -231,10 +230,9 @@ def _track(connection: Connection, num_settled: int) -> None:
         if event in EVENTS:
             seen.built.append(Built(number, EVENTS[event], str(words.get("fun_name", "?")), duration_secs))
 
-    params = delo_jax.load(WEIGHTS)
-    odometry = delo_jax.LidarOdometry(params)
+    odometry = delo_jax.LidarOdometry(delo_jax.load(WEIGHTS))
     jax.monitoring.register_event_duration_secs_listener(note)
-    compile_model(params, use_map=True)
+    odometry.compile()
     while (sweep := connection.recv()) is not None:
         number += 1
         frame = odometry.register(sweep.points, sweep.stamp_ns, sweep.times_s)

@@ -86,7 +86,8 @@ def load(name: str | Path = "delo-base") -> delo.Model:
         raise WeightsError(
             f"{path}: expected the arrays of preset {cfg.name!r}, got other shapes or types at {', '.join(wrong[:3])}; use matching weights"
         )
-    return delo.Model(jax.tree_util.tree_unflatten(tree, [jnp.asarray(tensors[name]) for name in names]), cfg)
+    arrays = jax.device_put([tensors[name] for name in names])  # at once: one by one JAX compiles a transfer for every shape
+    return delo.Model(jax.tree_util.tree_unflatten(tree, arrays), cfg)
 
 
 def save(path: str | Path, model: delo.Model, card: dict[str, Any]) -> Path:

@@ -86,8 +86,8 @@ def _works(name: str) -> Iterator[Check]:
     import numpy as np
 
     import delo_jax
-    from delo_jax.cli.method import compile_model
     from delo_jax.metrics.registration import pose_errors
+    from delo_jax.pipeline.compiled import compile_odometry
     from delo_jax.sim import simulate_drive
 
     try:
@@ -95,7 +95,7 @@ def _works(name: str) -> Iterator[Check]:
     except DeloError as error:
         yield Check("self-test", f"not run: {error}", "give weights that can be used by --weights")
         return
-    yield Check("compiling odometry", f"{compile_model(params, use_map=params.cfg.fine.num_iters > 0):.1f} s")
+    yield Check("compiling odometry", f"{compile_odometry(params, use_map=params.cfg.fine.num_iters > 0):.1f} s")
     begin = time.perf_counter()
     target, source = simulate_drive("mixed", 500_103, 2)
     yield Check("compiling the simulator", f"{time.perf_counter() - begin:.1f} s")

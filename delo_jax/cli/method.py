@@ -1,21 +1,17 @@
 """What follows the scans of a run: this package's odometry, or another method's."""
 
 import time
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import numpy as np
-
-from delo_jax import inference, weights
+from delo_jax import weights
 from delo_jax.baselines.icp import Icp, PointToPlane
 from delo_jax.baselines.registry import METHODS, Method
 from delo_jax.cli.console import parts
 from delo_jax.errors import ConfigError
 from delo_jax.model.delo import Model
 from delo_jax.pipeline.baseline_odometry import BaselineOdometry
+from delo_jax.pipeline.compiled import compile_odometry, functions
 from delo_jax.pipeline.lidar_odometry import LidarOdometry
-from delo_jax.pipeline.scan_to_map import compile_steps
 from delo_jax.uncertainty import stream
 
 
@@ -82,36 +78,11 @@ def package_versions(name: str) -> dict[str, str | None]:
     return {} if method.package is None else {method.package: method.package_version}
 
 
-def compile_model(params: Model, *, use_map: bool, begins: Callable[[str], None] = lambda part: None) -> float:
-    """Compiles everything that odometry will call, and returns how long it took [s]: shapes are fixed, so a scan without points does.
-
-    Args:
-        params: weights.
-        use_map: also what registers to a map.
-        begins: told each of `num_parts` by name.
-    """
-    begin = time.perf_counter()
-    empty = inference.prepare(params, np.zeros((0, 3), np.float32))
-    begins("encoder")
-    jax.block_until_ready(empty.encoding)
-    begins("solver")
-    inference.align(params, empty, empty, np.eye(4))
-    if use_map:
-        begins("steps on the map")
-        compile_steps(params)
-    return time.perf_counter() - begin
-
-
-def num_parts(*, use_map: bool) -> int:
-    """Of `compile_model`."""
-    return 3 if use_map else 2
-
-
 def _compile(method: Method, params: Model | None, *, use_map: bool) -> float:
     """Compiles what is compiled, behind a bar; the time it took [s]."""
     if params is not None:
-        with parts("compiling", num_parts(use_map=use_map)) as begins:
-            return compile_model(params, use_map=use_map, begins=begins)
+        with parts("compiling", len(functions(params, use_map=use_map))) as begins:
+            return compile_odometry(params, use_map=use_map, begins=begins)
     begin = time.perf_counter()
     if method.pair in (Icp, PointToPlane):
         with parts("compiling", 1) as begins:

@@ -5,12 +5,17 @@ are static: the loops must have a fixed length to be differentiable. Few iterati
 says what is left.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Int
 
 _FORBIDDEN = -1e30  # log-weight of a padded pair; finite, so that no difference of two of them is NaN
+_FLOOR = -80.0  # log-weight below the best of its row that a float32 still holds
+_REACH = 40.0  # of the potentials; what the floor has cut off is then less than exp(-40) of its row
+_TINY = 1e-30
 
 Scalar = float | Float[Array, ""]
 
@@ -61,10 +66,47 @@ def _cap_by_turns(scores, a, b, mass, num_iters, *, spread, over_rows, gives_bac
     return scores + f + spread(g) + h
 
 
+def _cap_by_products(scores, valid, a, b, mass, num_iters, *, gives_back=True, scale_first=True):
+    """The log plan of `_cap_by_turns`, and whether it is to be trusted: the same rounds as products of one matrix with vectors.
+
+    With r the largest score of each row and K = exp(S - r), LSE_j(S + g) = r + log K e^g, and likewise for columns: a round
+    takes two products in place of three passes of exponentials. A weight below the floor counts as the floor, which
+    is without effect unless a potential has to make up for it.
+    """
+    top = jax.lax.stop_gradient(jnp.max(scores, axis=1))
+    top = jnp.where(top > 0.5 * _FORBIDDEN, top, 0.0)
+    K = jnp.where(valid, jnp.exp(jnp.maximum(scores - top[:, None], _FLOOR)), 0.0)
+    log_a, log_b, log_mass = _log(a) - top, _log(b), _log(jnp.asarray(mass, scores.dtype))
+
+    def log(x):
+        return jnp.log(jnp.maximum(x, _TINY))
+
+    def in_all(f, rows):  # LSE of everything
+        highest = jax.lax.stop_gradient(jnp.max(f + top))
+        return highest + log(jnp.exp(f + top - highest) @ rows)
+
+    def project(_, state):
+        f, g, h, rows, reach = state
+        f = jnp.where(a > 0, jnp.minimum(log_a - h - log(rows), 0.0 if gives_back else f), 0.0)
+        highest = jax.lax.stop_gradient(jnp.max(f + top))
+        columns = highest + log(jnp.exp(f + top - highest) @ K)
+        g = jnp.where(b > 0, jnp.minimum(log_b - h - columns, 0.0 if gives_back else g), 0.0)
+        rows = K @ jnp.exp(g)
+        return f, g, log_mass - in_all(f, rows), rows, jnp.minimum(reach, jnp.minimum(jnp.min(f), jnp.min(g)))
+
+    f, g = jnp.zeros_like(log_a), jnp.zeros_like(log_b)
+    rows = jnp.sum(K, axis=1)
+    h = log_mass - in_all(f, rows) if scale_first else jnp.zeros_like(log_mass)
+    f, g, h, _, reach = jax.lax.fori_loop(0, num_iters, project, (f, g, h, rows, jnp.zeros_like(log_mass)))
+    return scores + f[:, None] + g[None, :] + h, reach > -_REACH
+
+
 def _dense(cost, epsilon, a, b, mass, num_iters, **how):
     valid = (a > 0)[:, None] & (b > 0)[None, :]
     scores = _log_weights(cost, epsilon, valid)
-    log_plan = _cap_by_turns(scores, a, b, mass, num_iters, spread=_by_column, over_rows=_column_logsumexp, **how)
+    fast, trusted = _cap_by_products(scores, valid, a, b, mass, num_iters, **how)
+    slow = functools.partial(_cap_by_turns, scores, a, b, mass, num_iters, spread=_by_column, over_rows=_column_logsumexp, **how)
+    log_plan = jax.lax.cond(trusted, lambda: fast, slow)
     return jnp.where(valid & (mass > 0), jnp.exp(log_plan), 0.0)
 
 

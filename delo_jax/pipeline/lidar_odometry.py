@@ -11,6 +11,7 @@ from delo_jax import inference
 from delo_jax.geometry import se3
 from delo_jax.inference import Estimate, PreparedScan
 from delo_jax.model.delo import Model
+from delo_jax.pipeline.compiled import compile_odometry
 from delo_jax.pipeline.motion_model import NANOSECOND, ConstantVelocity, is_near
 from delo_jax.pipeline.scan_to_map import Located, MapTracker, Steps
 from delo_jax.pipeline.stamps import checked_stamp, checked_times
@@ -116,6 +117,10 @@ class LidarOdometry:
         self._num_frames, self._last_stamp_ns, self._num_rejected = 0, 0, 0
         self._last_scan: PreparedScan | None = None
         self._trajectory = Trajectory()
+
+    def compile(self) -> float:
+        """Compiles now what would be compiled at the second scan, and returns how long it took [s]: no scan waits for a compiler."""
+        return compile_odometry(self._params, use_map=self._map is not None)
 
     def register(self, points: np.ndarray, stamp_ns: int | None = None, times_s: np.ndarray | None = None) -> Frame:
         """Pose of the sensor at this scan; the first usable scan defines the world frame.

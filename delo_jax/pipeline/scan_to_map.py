@@ -189,22 +189,6 @@ def require_fine_stage(params: Model) -> None:
         raise ConfigError(f"map: {what}")
 
 
-def compile_steps(params: Model) -> None:
-    """Compiles what `register` calls: shapes are fixed, so surfaces that show nothing do.
-
-    Raises:
-        ConfigError: a network without a fine stage.
-    """
-    require_fine_stage(params)
-    nothing = inference.prepare(params, np.zeros((0, 3), np.float32))
-    few, many = surfaces_of(nothing.scan, slice(0, NUM_LEARNED_POINTS)), surfaces_of(nothing.scan)
-    identity = np.eye(4, dtype=np.float32)
-    jax.block_until_ready(inference.fine_step(params, few, few, identity))
-    _robust(many, many, identity, ROBUST_STEPS)
-    rows = many.points, many.normals, many.mask, np.zeros(len(many.points), np.float32), many.points, many.normals
-    jax.block_until_ready(inference.sweep_steps(*rows, identity, np.zeros(6, np.float32), **SWEEP_OPTIONS))
-
-
 class MapTracker:
     """The local map of a drive, how well scans have fitted it lately, and what that says of the next one."""
 

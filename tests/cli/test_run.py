@@ -191,8 +191,9 @@ def test_compiling_shows_how_far_it_is(tree, cli, monkeypatch, tmp_path):
     for name, value in {"FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "120"}.items():
         monkeypatch.setenv(name, value)
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", cli(*arguments, tmp_path / "terminal").err)
-    for number, part in enumerate(("encoder", "solver", "steps on the map")):
-        assert re.search(rf"compiling .* {number}/3 0:00:\d\d {part}", shown)
+    names = "encoder", "solver", "covariance", "learned step", "classical steps", "steps of a sweep"
+    for number, name in enumerate(names):
+        assert re.search(rf"compiling .* {number}/{len(names)} 0:00:\d\d {name}", shown)
 
 
 def test_a_folder_with_a_run_is_left_alone(folder, tree, cli):
