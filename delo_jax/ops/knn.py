@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 _UNREACHABLE = float("inf")
+_BLOCK = 256  # points whose distances are in the cache at once
 
 
 def _squared_distances(a, b):
@@ -25,9 +26,9 @@ def nearest(
     """Index of the nearest valid point to each query, and the squared distance to it.
 
     A packed arg-min: the bits of a non-negative float32 sort like an integer, so the low bits of the distance are
-    replaced by the index and one integer minimum finds both (on a CPU, a hundredth of the time of
-    `lax.approx_min_k`). The price: ceil(log2 m) bits of the 23-bit mantissa, so squared distances within a factor
-    1 + m / 2^22 (1e-3 at m = 4096) may count as ties, which the lowest index wins.
+    replaced by the index and one integer minimum finds both, block by block of the points. The price: ceil(log2 m) bits of
+    the 23-bit mantissa, so squared distances within a factor 1 + m / 2^22 (1e-3 at m = 4096) may count as ties, which
+    the lowest index wins. `benchmarks/neighbours.py` has the times of other ways.
 
     Args:
         queries: [m], finite.
@@ -37,12 +38,22 @@ def nearest(
     Returns:
         Index (int32), and the exact squared distance [m^2], differentiable; 0 and infinity when no point is valid.
     """
-    low_bits = (1 << (points.shape[0] - 1).bit_length()) - 1
-    squared = _squared_distances(*jax.lax.stop_gradient((points, queries)))
-    reachable = jnp.where(mask[:, None], squared, _UNREACHABLE)
-    keys = jax.lax.bitcast_convert_type(reachable.astype(jnp.float32), jnp.int32)
-    packed = (keys & ~low_bits) | jnp.arange(points.shape[0], dtype=jnp.int32)[:, None]
-    index = jnp.min(packed, axis=0) & low_bits  # over the leading axis: a CPU takes the minimum of whole vectors
+    num, size = points.shape[0], min(_BLOCK, points.shape[0])
+    low_bits = (1 << (num - 1).bit_length()) - 1
+    padding = -num % size
+    blocks = jnp.pad(points, ((0, padding), (0, 0))), jnp.pad(mask, (0, padding)), jnp.arange(num + padding, dtype=jnp.int32)
+    fixed = jax.lax.stop_gradient(queries)
+
+    def nearer(best, block):
+        points, mask, index = block
+        reachable = jnp.where(mask[:, None], _squared_distances(points, fixed), _UNREACHABLE)
+        keys = jax.lax.bitcast_convert_type(reachable.astype(jnp.float32), jnp.int32)
+        packed = (keys & ~low_bits) | index[:, None]
+        return jnp.minimum(best, jnp.min(packed, axis=0)), None  # over the leading axis: a CPU takes the minimum of whole vectors
+
+    farthest = jnp.full(queries.shape[0], jnp.iinfo(jnp.int32).max)
+    split = [jax.lax.stop_gradient(array).reshape(-1, size, *array.shape[1:]) for array in blocks]
+    index = jax.lax.scan(nearer, farthest, split)[0] & low_bits
     difference = queries - points[index]
     exact = jnp.sum(difference * difference, axis=1)
     return index, jnp.where(mask[index], exact, _UNREACHABLE)
