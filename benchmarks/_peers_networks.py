@@ -69,7 +69,7 @@ def time_presets(sweeps: Sequence[tuple[Sweep, Sweep]], num: int, warm_up: int, 
 
         return solve
 
-    return in_turns({name: call(model) for name, model in presets(small).items()}, num, warm_up=warm_up)
+    return in_turns({name: call(model) for name, model in presets(small).items()}, num, warm_up=warm_up, pause_s=0.0)
 
 
 def torch_missing() -> str:
@@ -163,16 +163,6 @@ class Twin:
             return self._procrustes(source, target, plan, 0.0).numpy()
 
 
-def forward(model: delo.Model, source: Scan, target: Scan) -> jax.Array:
-    """T_target_source of two scans, nothing kept."""
-    return delo.solve(model, delo.encode(model, source), delo.encode(model, target), jnp.eye(4)).T_target_source
-
-
-def solved(model: delo.Model, source: delo.Encoding, target: delo.Encoding) -> jax.Array:
-    """T_target_source of two encoded scans."""
-    return delo.solve(model, source, target, jnp.eye(4)).T_target_source
-
-
 class PaperSize(NamedTuple):
     """What was measured at paper size."""
 
@@ -186,15 +176,17 @@ Call = Callable[[int], np.ndarray]  # the number of the turn in, a pose on the h
 
 def ours_at_paper_size(transport: delo.Model, softmax: delo.Model, scans: Sequence[ScanPair]) -> dict[str, Call]:
     """Both heads with nothing kept, and the streaming use of one."""
-    kept = with_older_encoded(transport, scans)
-    jitted, encode, solve = jax.jit(forward), jax.jit(delo.encode), jax.jit(solved)
+    kept, start = with_older_encoded(transport, scans), jnp.eye(4)
+
+    def solved(model: delo.Model, source: delo.Encoding, target: delo.Encoding) -> np.ndarray:
+        return np.asarray(inference.solve(model, source, target, start).T_target_source)
 
     def whole(model: delo.Model) -> Call:
-        return lambda turn: np.asarray(jitted(model, *scans[turn % len(scans)]))
+        return lambda turn: solved(model, *(inference.encode(model, scan) for scan in scans[turn % len(scans)]))
 
     def streaming(turn: int) -> np.ndarray:
         source, target = kept[turn % len(kept)]
-        return np.asarray(solve(transport, source, encode(transport, target)))
+        return solved(transport, source, inference.encode(transport, target))
 
     return {SOFTMAX: whole(softmax), TRANSPORT: whole(transport), STREAMING: streaming}
 

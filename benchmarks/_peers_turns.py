@@ -10,7 +10,7 @@ import numpy as np
 from delo_jax.bench.timing import NOT_BUILT, Timing
 
 PAUSE_S = 0.02
-"""Before each timed call: threads that the one before it has left spinning are asleep by then."""
+"""Before each timed call of several packages: threads that the one before has left spinning are asleep by then; JAX's own, too."""
 
 
 class Clock(NamedTuple):
@@ -45,19 +45,22 @@ def collected(times: Iterable[Timed], warm_up: int) -> dict[str, Timing]:
     return {name: Timing(NOT_BUILT, values[0], tuple(values[warm_up:])) for name, values in found.items()}
 
 
-def in_turns(calls: Mapping[str, Callable[[int], Any]], num: int, *, warm_up: int, clock: Clock = REAL) -> dict[str, Timing]:
+def in_turns(
+    calls: Mapping[str, Callable[[int], Any]], num: int, *, warm_up: int, pause_s: float = PAUSE_S, clock: Clock = REAL
+) -> dict[str, Timing]:
     """Times of calls, each until its result is there.
 
     Args:
         calls: functions of the number of the turn, which says what scans they get.
         num: turns that count.
         warm_up: turns before them, at least one: the first calls compile.
+        pause_s: before each call.
         clock: time.
     """
     times, names = [], list(calls)
     for turn in range(warm_up + num):
         for name in order(names, turn):
-            clock.sleep(PAUSE_S)
+            clock.sleep(pause_s)
             begin = clock.now()
             jax.block_until_ready(calls[name](turn))
             times.append(Timed(name, clock.now() - begin))

@@ -1,7 +1,7 @@
 """Times beside those of other packages, in one run: same scans, same threads, all taking turns at who is first.
 
-Three parts, on the CPU, pinned to two cores. Reading or rendering, compiling and warm-up are apart; a pause before each timed call lets the
-threads of the one before fall asleep.
+Three parts, on the CPU, pinned to two cores. Reading or rendering, compiling and warm-up are apart; where several packages take turns, a
+pause before each timed call lets the threads of the one before fall asleep.
 
 - networks: `base` and `tiny` alone, warm, the older scan encoded already: from the newer prepared scan to the pose.
 - drive: `delo run`, with its files, beside KISS-ICP (default configuration), small_gicp's GICP and VGICP, scan to scan and scan to model,

@@ -52,11 +52,15 @@ class MultiHeadAttention(nn.Module):
     ) -> Float[Array, "n d"]:
         """Attention of projected rows to projected keys; with no valid key, the bias of the output projection."""
         q, k, v = (rows.reshape(rows.shape[0], self.num_heads, -1).transpose(1, 0, 2) for rows in (query, key, value))
-        scores = (q * q.shape[-1] ** -0.5) @ k.transpose(0, 2, 1) + jnp.where(mask, 0.0, _FORBIDDEN)[None, None, :]
-        # A softmax that divides after the product with the values: three passes over n x m numbers fewer.
-        weights = jnp.exp(scores - jax.lax.stop_gradient(jnp.max(scores, axis=-1, keepdims=True)))
-        mixed = (weights @ v) / jnp.sum(weights, axis=-1, keepdims=True)
-        mixed = jnp.where(jnp.any(mask), mixed, 0.0)
+
+        def head(qkv):  # one after the other, which keeps n x m numbers in the cache
+            q, k, v = qkv
+            scores = (q * q.shape[-1] ** -0.5) @ k.T + jnp.where(mask, 0.0, _FORBIDDEN)[None, :]
+            # A softmax that divides after the product with the values: three passes over n x m numbers fewer.
+            weights = jnp.exp(scores - jax.lax.stop_gradient(jnp.max(scores, axis=-1, keepdims=True)))
+            return (weights @ v) / jnp.sum(weights, axis=-1, keepdims=True)
+
+        mixed = jnp.where(jnp.any(mask), jax.lax.map(head, (q, k, v)), 0.0)
         return self.out(mixed.transpose(1, 0, 2).reshape(query.shape))
 
 

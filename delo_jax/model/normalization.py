@@ -25,15 +25,15 @@ class BatchNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*n c"], mask: Bool[Array, "*n"]) -> Float[Array, "*n c"]:
-        """Normalised channels; finite but meaningless where masked."""
+        """Normalised channels; meaningless where masked, and finite there in training, or where x is."""
         channels = x.shape[-1:]
         scale = self.param("scale", nn.initializers.ones, channels)
         bias = self.param("bias", nn.initializers.zeros, channels)
         running_mean = self.variable("batch_stats", "mean", jnp.zeros, channels)
         running_var = self.variable("batch_stats", "var", jnp.ones, channels)
-        x = jnp.where(mask[..., None], x, 0.0)
         mean, var = running_mean.value, running_var.value
         if self.train:
+            x = jnp.where(mask[..., None], x, 0.0)  # else left out: a compiler then joins the rest with the product before it
             mean, var, count = self._moments(x, mask)
             if not self.is_initializing():
                 unbiased = var * count / jnp.maximum(count - 1.0, 1.0)
