@@ -11,6 +11,8 @@ from rich.progress import Progress
 
 POLL_S = 0.5
 _units: Any = None  # queue of this process to the one with the bar
+_shares: Any = None  # queue of cores that nobody has
+_own: list[int] = []  # cores of this process
 
 
 class Counting(Progress):
@@ -32,12 +34,12 @@ def cores() -> list[int]:
 
 
 def spread(function: Callable[..., None], tasks: list[tuple], num_workers: int, bar: Progress, title: str, total: int) -> None:
-    """Call a function of a module for every task, in the order given, as workers get free.
+    """Call a function of a module for every task, each in a process of its own, whose memory goes with it, in the order given.
 
     Args:
         function: of arguments that can be pickled; what it tracks with `Counting` is shown.
         tasks: its arguments, the longest first.
-        num_workers: processes; the cores are dealt out among them.
+        num_workers: processes at a time; the cores are dealt out among them.
         bar: progress.
         title: of the bar.
         total: units in all tasks.
@@ -47,8 +49,8 @@ def spread(function: Callable[..., None], tasks: list[tuple], num_workers: int, 
     for number in range(num_workers):
         shares.put(known[number::num_workers] or known)
     task = bar.add_task(title, total=total)
-    with ProcessPoolExecutor(num_workers, context, _start, (units, shares)) as pool:
-        running = {pool.submit(function, *arguments) for arguments in tasks}
+    with ProcessPoolExecutor(num_workers, context, _start, (units, shares), max_tasks_per_child=1) as pool:
+        running = {pool.submit(_call, function, arguments) for arguments in tasks}
         try:
             while running:
                 done, running = wait(running, timeout=POLL_S, return_when=FIRST_EXCEPTION)
@@ -62,10 +64,17 @@ def spread(function: Callable[..., None], tasks: list[tuple], num_workers: int, 
 
 def _start(units: Any, shares: Any) -> None:
     """Of a worker, before anything computes: libraries make as many threads as they find cores."""
-    global _units
-    _units = units
+    global _units, _shares, _own
+    _units, _shares, _own = units, shares, shares.get()
     if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, shares.get())
+        os.sched_setaffinity(0, _own)
+
+
+def _call(function: Callable[..., None], arguments: tuple) -> None:
+    try:
+        function(*arguments)
+    finally:
+        _shares.put(_own)
 
 
 def _drained(units: Any) -> int:
