@@ -1,4 +1,4 @@
-"""Nearest neighbours five ways: in XLA by arg-min, top-k, approximate minimum or an arg-min packed in integers, and by a tree on the host.
+"""Nearest neighbours six ways: in XLA by arg-min, top-k, approximate minimum or an arg-min packed in integers, and by a tree on the host.
 
 Sources and targets are points of one simulated scan, prepared; the targets of the larger rows are those of several. The tree is timed
 with its building (a scan is asked once) and without (a map's tree is asked several times a frame); results on the host are on the way to
