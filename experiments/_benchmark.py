@@ -169,7 +169,7 @@ class _Taken:
         return Pairs(errors.reshape(-1, 6), np.array([gap for gap, _ in self.errors]), seconds)
 
 
-def chosen(num_scans: int) -> set[tuple[int, int]]:
+def taken_pairs(num_scans: int) -> set[tuple[int, int]]:
     """(gap, source) of the pairs."""
     return {(gap, int(k)) for gap in GAPS if num_scans > gap for k in np.unique(np.linspace(0, num_scans - gap - 1, NUM_PAIRS).astype(int))}
 
@@ -223,7 +223,7 @@ def _one_pass(sequence: Sequence, entries: dict[str, Entry], new_poses: list[str
     running = [(name, start()) for name in new_poses if (start := entries[name].odometry) is not None]
     taken = {name: _Taken(make()) for name in new_pairs if (make := entries[name].pair) is not None}
     rows: dict[str, list[tuple[np.ndarray, float, bool]]] = {name: [] for name in new_poses}
-    wanted = chosen(sequence.num_scans)
+    wanted = taken_pairs(sequence.num_scans)
     truth: list[np.ndarray] = []
     scans: dict[int, np.ndarray] = {}
     for k, (sweep, T) in enumerate(bar.track(sequence.scans(), total=sequence.num_scans, description=sequence.name)):
