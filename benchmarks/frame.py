@@ -34,7 +34,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "planes and features": [(preprocess, "_describe")],
     "points that are kept, key points": [(preprocess, "_select"), (preprocess, "_keypoints")],
     "map around the prediction, its tree": [(scan_to_map.Surroundings, "__init__")],
-    "search for matches": [(scan_to_map.Surroundings, "matches")],
+    "search for matches": [(scan_to_map.Surroundings, "matches"), (scan_to_map.Surroundings, "matches_in_reach")],
     "learned steps": [(inference, "fine_step")],
     "classical steps": [(inference, "robust_steps")],
     "classical steps with the velocity": [(inference, "sweep_steps")],

@@ -17,12 +17,12 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import cKDTree
 
 from delo_jax.bench.suite import device_line
 from delo_jax.config import PreprocessConfig
+from delo_jax.geometry.neighbors import tree_of
 from delo_jax.ops.knn import nearest
-from delo_jax.preprocess import LEAF_SIZE, preprocess
+from delo_jax.preprocess import preprocess
 from delo_jax.sim import simulate_drive
 
 SIZES = ((512, 3072), (1024, 3072), (3072, 3072), (512, 9216), (3072, 9216))
@@ -44,11 +44,6 @@ WAYS: dict[str, Callable] = {
     "approx_min_k": lambda sources, targets: jax.lax.approx_min_k(squared(sources, targets), 1)[1][:, 0],
 }
 EXACT = "argmin", "top_k"
-
-
-def tree_of(targets: np.ndarray) -> cKDTree:
-    """As the package builds it."""
-    return cKDTree(targets, leafsize=LEAF_SIZE, balanced_tree=False, compact_nodes=False)
 
 
 def measure(sources: np.ndarray, targets: np.ndarray, calls: int) -> dict[str, np.ndarray]:

@@ -1,5 +1,6 @@
 """Raw points to a `Scan`: crop, voxels, plane fits, features, key points. Host code (NumPy, SciPy), deterministic."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +11,11 @@ from scipy.spatial import cKDTree
 from delo_jax.config import NUM_FEATURES, PreprocessConfig
 from delo_jax.errors import ScanError
 from delo_jax.geometry.deskew import sweep_poses
+from delo_jax.geometry.neighbors import nearest_in, tree_meanwhile
 from delo_jax.geometry.normals import plane_fit
 
 MIN_NEIGHBORS = 5  # a plane through fewer points says nothing
 MAX_RADIUS_M = 1.5  # of a neighbourhood
-LEAF_SIZE = 24  # of the tree of neighbours
 HORIZONTAL = 0.85  # |n_z| above which a surface counts as ground-like
 
 
@@ -83,15 +84,18 @@ def preprocess_timed(points: np.ndarray, times_s: np.ndarray | None, cfg: Prepro
     """
     points, rng = check_points(points), np.random.default_rng(0)  # the same scan gives the same bytes
     rows = np.arange(len(points)) if cfg.sampling == "raw" else _thinned(len(points), cfg.max_raw_points, rng)
-    columns = points.take(rows, axis=0)
+    columns = np.empty((len(rows), 3 if times_s is None else 4), np.float32)
+    columns[:, :3] = points.take(rows, axis=0)
     if times_s is not None:
-        columns = np.column_stack([columns, np.nan_to_num(times_s.take(rows).astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)])
+        times = times_s.take(rows)
+        columns[:, 3] = np.where(np.isfinite(times), times, 0.0)
     columns = _crop(columns, cfg)
     if cfg.sampling == "raw":
         return _raw_scan(columns, cfg, rng)
     cloud = voxel_mean(columns, cfg.voxel_m)
+    tree = tree_meanwhile(cloud[:, :3])
     rows = one_per_voxel(cloud, cfg.point_voxel_m, rng)[: 2 * cfg.max_points]
-    centers, normals, features, valid = _describe(np.ascontiguousarray(cloud[:, :3]), rows, cfg)
+    centers, normals, features, valid = _describe(np.ascontiguousarray(cloud[:, :3]), tree, rows, cfg)
     kept = _select(normals, valid, cfg, rng)
     points, normals, features = centers[kept], normals[kept], features[kept]
     keypoints = _keypoints(points, normals, cfg, rng)
@@ -194,16 +198,18 @@ def one_per_voxel(points: np.ndarray, size: float, rng: np.random.Generator) -> 
     return order[np.sort(places[starts])]
 
 
-def _describe(cloud: np.ndarray, rows: np.ndarray, cfg: PreprocessConfig):
+def _describe(cloud: np.ndarray, tree: Callable[[], cKDTree], rows: np.ndarray, cfg: PreprocessConfig):
     """Plane fits around `cloud[rows]`: points (on their plane where there is one), normals, features, validity."""
     if len(cloud) < MIN_NEIGHBORS:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, NUM_FEATURES), np.float32), np.zeros(0, bool)
     points = cloud[rows]
     ranges = np.linalg.norm(points, axis=1)
     radius = np.minimum(0.5 + 0.04 * ranges, MAX_RADIUS_M)
-    tree = cKDTree(cloud, leafsize=LEAF_SIZE, balanced_tree=False, compact_nodes=False)
     k = min(cfg.num_neighbors, len(cloud))
-    distances, index = tree.query(points, k=k, distance_upper_bound=MAX_RADIUS_M)
+    order = np.argsort(rows)  # the cloud is sorted by voxel: neighbours are asked for one after the other
+    back = np.empty_like(order)
+    back[order] = np.arange(len(order))
+    distances, index = (found.take(back, axis=0) for found in nearest_in(tree(), points[order], k, MAX_RADIUS_M))
     near = distances <= radius[:, None]
     center, normal, eigenvalues = plane_fit(cloud.take(np.where(near, index, rows[:, None]), axis=0), near)
     planar = eigenvalues[:, 0] < 0.1 * eigenvalues[:, 1]

@@ -8,10 +8,11 @@ from scipy.spatial import cKDTree
 
 from delo_jax.baselines.protocols import Aligned, PairMethod
 from delo_jax.geometry import se3
+from delo_jax.geometry.neighbors import nearest_in, tree_of
 from delo_jax.geometry.normals import plane_fit
 from delo_jax.geometry.point_to_plane import point_to_plane_step
 from delo_jax.geometry.procrustes import weighted_procrustes
-from delo_jax.preprocess import LEAF_SIZE, voxel_mean
+from delo_jax.preprocess import voxel_mean
 
 VOXEL_M = 0.25
 GATES_M = (2.0, 0.5)  # a match farther apart is none; the second holds once steps with the first have settled
@@ -54,7 +55,7 @@ class Icp(PairMethod):
     def prepare(self, points: np.ndarray) -> Cloud:
         """Means of voxels, and a tree of them."""
         thin = voxel_mean(points.astype(np.float32), VOXEL_M)
-        tree = cKDTree(thin, leafsize=LEAF_SIZE, balanced_tree=False, compact_nodes=False)
+        tree = tree_of(thin)
         return Cloud(thin, tree, *self._planes(thin, tree))
 
     def align(self, source: Cloud, target: Cloud, T_target_source_init: np.ndarray) -> Aligned:
@@ -77,7 +78,7 @@ class Icp(PairMethod):
     def _delta(self, points: np.ndarray, target: Cloud, T: np.ndarray, gate_m: float) -> np.ndarray:
         """One step, a correction in the target frame; NaN without a match."""
         moved = points @ T[:3, :3].T + T[:3, 3]
-        distances, index = target.tree.query(moved, distance_upper_bound=gate_m)
+        distances, index = nearest_in(target.tree, moved, 1, gate_m)
         index = np.minimum(index, len(target.points) - 1)  # where nothing is within reach it is one too many
         weights = (distances < gate_m) & target.planar[index]
         if not weights.any():
@@ -96,7 +97,7 @@ class PointToPlane(Icp):
     step = staticmethod(_towards_planes)
 
     def _planes(self, points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray]:
-        distances, index = tree.query(points, k=NUM_NEIGHBORS, distance_upper_bound=PLANE_RADIUS_M)
+        distances, index = nearest_in(tree, points, NUM_NEIGHBORS, PLANE_RADIUS_M)
         near = np.isfinite(distances)
         fit = plane_fit(points[np.where(near, index, 0)], near)
         flat = fit.eigenvalues[:, 0] < PLANAR * fit.eigenvalues[:, 1]

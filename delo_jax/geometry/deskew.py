@@ -20,7 +20,7 @@ def sweep_poses(times_s: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     times_s = np.where(np.isfinite(times_s), times_s, 0.0)
     first, last = float(np.min(times_s)), float(np.max(times_s))
     instants = np.linspace(first, last, NUM_INSTANTS)
-    poses = se3.exp(instants[:, None] * velocity[None, :]).astype(np.float32)
+    poses = se3.exp_along(velocity, instants).astype(np.float32)
     return poses[np.rint((times_s - first) * ((NUM_INSTANTS - 1) / max(last - first, 1e-9))).astype(np.int64)]
 
 

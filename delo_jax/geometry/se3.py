@@ -79,6 +79,18 @@ def exp(xi: Float[AnyArray, "*b 6"]) -> Float[AnyArray, "*b 4 4"]:
     return _assemble(eye + a * W + b * WW, (V @ v[..., None])[..., 0])
 
 
+def exp_along(xi: Float[np.ndarray, "6"], times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
+    """Poses reached by following one twist for each of these times, `exp(times[k] * xi)`; on the host."""
+    W, v = skew(xi[:3]), xi[3:]
+    a, b, c = _rotation_coefficients(np.square(times) * np.dot(xi[:3], xi[:3]))
+    weights = np.stack([np.ones_like(times), times, a * times, b * times**2, c * times**3], axis=1)
+    parts = np.zeros((5, 4, 4))
+    parts[0], parts[1, :3, 3] = np.eye(4), v
+    parts[2, :3, :3], parts[3, :3, :3] = W, W @ W
+    parts[3, :3, 3], parts[4, :3, 3] = W @ v, W @ (W @ v)
+    return (weights @ parts.reshape(5, 16)).reshape(-1, 4, 4)
+
+
 def _rotation_log(R):
     """Rotation vector (*b, 3) of R, by way of the quaternion.
 

@@ -42,6 +42,14 @@ def test_exp_is_the_matrix_exponential(angle):
 
 
 @pytest.mark.parametrize("angle", ANGLES)
+def test_exp_along_a_twist_is_the_matrix_exponential(angle):
+    """Oracle: scipy.linalg.expm of the twist times each time, before and after 0."""
+    times = np.linspace(-1.0, 0.5, 7)
+    for xi in twists(angle):
+        np.testing.assert_allclose(se3.exp_along(xi, times), [expm(hat(t * xi)) for t in times], atol=5e-13)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
 def test_log_inverts_the_matrix_exponential_up_to_pi(angle):
     """Oracle: the twist that scipy's expm was given; no angle below pi is special, that of a half turn included."""
     xi = twists(angle)
