@@ -197,20 +197,18 @@ def recorded(tree: Path, sequence: str, num_scans: int, advance: Callable[[], No
 
 
 def follow(
-    drive: Drive, methods: Mapping[str, Odometry], warm_up: int, in_a_row: int, advance: Callable[[int], None] = lambda _: None
+    drive: Drive, methods: Mapping[str, Odometry], warm_up: int, advance: Callable[[], None] = lambda: None
 ) -> tuple[dict[str, Timing], dict[str, np.ndarray]]:
-    """Times of each method and its poses; all see so many scans in a row before any sees the next ones."""
+    """Times of each method and its poses; all see a scan before any sees the next."""
     times, names = [], list(methods)
     poses: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    for turn, first in enumerate(range(0, len(drive.sweeps), in_a_row)):
-        sweeps = drive.sweeps[first : first + in_a_row]
+    for turn, sweep in enumerate(drive.sweeps):
         for name in order(names, turn):
             time.sleep(PAUSE_S)
-            for sweep in sweeps:
-                T_world_lidar, seconds = methods[name](sweep)
-                times.append(Timed(name, seconds))
-                poses[name].append(T_world_lidar)
-        advance(len(sweeps))
+            T_world_lidar, seconds = methods[name](sweep)
+            times.append(Timed(name, seconds))
+            poses[name].append(T_world_lidar)
+        advance()
     return collected(times, warm_up), {name: np.stack(Ts) for name, Ts in poses.items()}
 
 

@@ -5,8 +5,7 @@ pause before each timed call lets the threads of the one before fall asleep.
 
 - networks: `base` and `tiny` alone, warm, the older scan encoded already: from the newer prepared scan to the pose.
 - drive: `delo run`, with its files, beside KISS-ICP (default configuration), small_gicp's GICP and VGICP, scan to scan and scan to model,
-  and KISS-Matcher from the identity. Only their own calls are timed of the peers; settings: see `delo_jax/baselines/`. Each takes 20 scans
-  in a row, as in a stream; with `--in-a-row 1` every scan meets caches that all others have filled since.
+  and KISS-Matcher from the identity. Only their own calls are timed of the peers; settings: see `delo_jax/baselines/`.
 - paper: the paper's network at N = 1024, D = 512 without its evidence head, jitted and in PyTorch (same weights, float32, inference mode).
   Ratios there are medians over the turns.
 
@@ -38,7 +37,6 @@ from rich.progress import Progress
 import delo_jax
 from delo_jax.baselines.protocols import NUM_THREADS
 from delo_jax.bench.timing import UNKNOWN, Timing
-from delo_jax.config import require
 
 PARTS = ("networks", "drive", "paper")
 MOST_MS = {networks.BASE: 25.0, networks.TINY_WIDE: 10.0, networks.TINY: 10.0}
@@ -146,19 +144,19 @@ def take_drive(args: argparse.Namespace, num_scans: int, bar: Progress) -> drive
     return drives.recorded(args.data, args.sequence, num_scans, advance) if args.data else drives.simulated(num_scans, advance)
 
 
-def run_drive(drive: drives.Drive, settings: Settings, in_a_row: int, bar: Progress) -> list[Row]:
+def run_drive(drive: drives.Drive, settings: Settings, bar: Progress) -> list[Row]:
     """Times all odometries and prints them."""
     task = bar.add_task("drive", total=len(drive.sweeps))
     with tempfile.TemporaryDirectory() as folder:
         methods = drives.odometries(delo_jax.load("delo-base"), Path(folder))
-        found, poses = drives.follow(drive, methods, settings.warm_up, in_a_row, lambda num: bar.advance(task, num))
+        found, poses = drives.follow(drive, methods, settings.warm_up, lambda: bar.advance(task))
         drives.close(methods)
     errors = drives.step_errors(drive, poses, settings.warm_up)
-    print("\n" + turns.table(f"{drive.name}, {in_a_row} in a row", found, errors, "error of a step, median / largest cm"), flush=True)
+    print("\n" + turns.table(drive.name, found, errors, "error of a step, median / largest cm"), flush=True)
     return drive_rows(found)
 
 
-def measured(parts: list[str], drive: drives.Drive, settings: Settings, bar: Progress, *, in_a_row: int, quick: bool) -> list[Row]:
+def measured(parts: list[str], drive: drives.Drive, settings: Settings, bar: Progress, *, quick: bool) -> list[Row]:
     """All rows."""
     rows, pairs = list[Row](), drives.pairs(drive, settings.num_pairs)
     if "networks" in parts:
@@ -172,7 +170,7 @@ def measured(parts: list[str], drive: drives.Drive, settings: Settings, bar: Pro
         if missing := networks.torch_missing():
             print(f"\n{missing}", flush=True)
     if "drive" in parts:
-        rows += run_drive(drive, settings, in_a_row, bar)
+        rows += run_drive(drive, settings, bar)
     return rows
 
 
@@ -182,10 +180,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="what is measured; other bounds are not judged")
     parser.add_argument("--data", type=Path, help="tree of recorded sequences; a simulated drive by default")
     parser.add_argument("--sequence", default="odo_00_056", help="of that tree")
-    parser.add_argument("--in-a-row", type=int, default=20, metavar="SCANS", help="that an odometry takes before it is another one's turn")
-    args = parser.parse_args(argv)
-    require(args.in_a_row >= 1, "in-a-row", "1 or more", args.in_a_row)
-    return args
+    return parser.parse_args(argv)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -196,10 +191,9 @@ def main(argv: list[str] | None = None) -> int:
     num_scans = settings.num_scans if "drive" in args.parts else 2 * settings.num_pairs
     with _harness.progress() as bar:
         drive = take_drive(args, num_scans, bar)
-        rows = measured(args.parts, drive, settings, bar, in_a_row=args.in_a_row, quick=args.quick)
+        rows = measured(args.parts, drive, settings, bar, quick=args.quick)
     print(f"\n{about}; load {before} before, {load()} after")
-    used = {"in_a_row": args.in_a_row, "parts": args.parts, "drive": drive.name, "machine": about}
-    return _harness.finish(rows, settings._asdict() | used, args)
+    return _harness.finish(rows, settings._asdict() | {"parts": args.parts, "drive": drive.name, "machine": about}, args)
 
 
 if __name__ == "__main__":
