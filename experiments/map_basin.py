@@ -35,9 +35,9 @@ from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.geometry import se3
 from delo_jax.metrics.registration import pose_errors
 from delo_jax.model.delo import Model
-from delo_jax.pipeline.local_map import LocalMap, surfaces_of
+from delo_jax.pipeline.local_map import LocalMap, Surroundings, surfaces_of
 from delo_jax.pipeline.motion_model import NANOSECOND
-from delo_jax.pipeline.scan_to_map import NUM_LEARNED_POINTS, RECOVERY_STEPS, MapTracker, Steps, Surroundings, register
+from delo_jax.pipeline.scan_to_map import NUM_LEARNED_POINTS, REACH_M, RECOVERY_STEPS, MapTracker, Steps, register
 from delo_jax.sim import simulate_drive
 
 REAL, NUM_SCANS, NUM_REAL = "odo_00_056", 60, 40
@@ -111,14 +111,14 @@ def vgicp(scene: Scene, T_world_start: np.ndarray) -> np.ndarray:
 
 def classical(scene: Scene, T_world_start: np.ndarray) -> np.ndarray:
     """Robust point to plane on the same map at the gate of the pipeline, more rounds."""
-    near = Surroundings(scene.local_map, T_world_start)
+    near = Surroundings(scene.local_map, T_world_start, REACH_M)
     fix = register(scene.params, scene.scan, near, np.eye(4), num_learned=0, num_rounds=NUM_ROUNDS)
     return T_world_start @ fix.T_start_lidar
 
 
 def closing(scene: Scene, T_world_start: np.ndarray) -> np.ndarray:
     """The same behind rounds on fewer points whose gate closes."""
-    near, source = Surroundings(scene.local_map, T_world_start), surfaces_of(scene.scan.scan, slice(0, NUM_LEARNED_POINTS))
+    near, source = Surroundings(scene.local_map, T_world_start, REACH_M), surfaces_of(scene.scan.scan, slice(0, NUM_LEARNED_POINTS))
     T = np.eye(4, dtype=np.float32)
     for scale_m, reach_m in CLOSING_GATE:
         matched = near.matches(source, T)

@@ -8,25 +8,21 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy.spatial import cKDTree
 
 from delo_jax import inference
 from delo_jax.config import require
 from delo_jax.errors import ConfigError
 from delo_jax.geometry import se3
-from delo_jax.geometry.neighbors import nearest_in, tree_of
 from delo_jax.geometry.point_to_plane import RobustFit, SweepFit
 from delo_jax.inference import Estimate, PreparedScan
 from delo_jax.model.delo import Model, Surfaces
-from delo_jax.pipeline.local_map import CROP_M, LocalMap, surfaces_of
+from delo_jax.pipeline.local_map import LocalMap, Surroundings, surfaces_of
 from delo_jax.uncertainty import covariance, status, stream
 from delo_jax.uncertainty.observability import observability
 
 NUM_LEARNED_POINTS = 512  # the robust steps take all
 ROBUST_STEPS, SWEEP_STEPS = 4, 2  # between two searches for matches
 SCALE_M, REACH_M = 0.1, 0.8
-MARGIN_M = 0.2  # beyond the reach that is searched, too, so that what comes into reach is known beforehand
-ROUNDING_M = 1e-6
 SWEEP_OPTIONS: dict[str, Any] = {
     "scale_m": SCALE_M,
     "reach_m": REACH_M,
@@ -37,7 +33,6 @@ SWEEP_OPTIONS: dict[str, Any] = {
 SETTLED = np.repeat([0.05, 0.15], 3)  # change of the velocity that needs no other round [rad/s, m/s]
 MAX_ROUNDS = 5
 UNSTEADY = np.repeat([0.35, 2.0], 3)  # change of the velocity, by which it is not constant within a sweep either [rad/s, m/s]
-MIN_TARGETS = 100
 RECOVERY_STEPS = 12
 INSERT_M, INSERT_DEG = 1.0, 5.0  # motion since the last insertion
 NUM_RECENT = 20  # scans whose scores say what is usual
@@ -89,68 +84,6 @@ class Located(NamedTuple):
     swing: stream.Swing  # with this motion
     scan: PreparedScan  # as it was registered: de-skewed with this motion
     score: float  # as of its fix
-
-
-class Nearest:
-    """The nearest of a tree's points within reach, searched for anew only where it may have become another one.
-
-    Where the nearest is d1 away and the next d2, the nearest stays while the point moves by less than (d2 - d1) / 2 (triangle inequality).
-
-    Args:
-        tree: of the points to find.
-        reach_m: farther away, nothing is found.
-    """
-
-    def __init__(self, tree: cKDTree, reach_m: float):
-        self._tree, self._reach_m = tree, reach_m
-        self._points = np.zeros((0, 3), np.float32)  # where each was when it was searched for
-        self._index, self._slack_m = np.zeros(0, np.int64), np.zeros(0)
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Index of the nearest of each of (n, 3) points; the number of the tree's points where none is within reach."""
-        if len(points) == len(self._points):
-            moved_m = np.linalg.norm(points - self._points, axis=1)
-            anew = np.flatnonzero(moved_m >= self._slack_m - ROUNDING_M)
-        else:
-            self._points, self._index, self._slack_m = np.empty_like(points), np.empty(len(points), np.int64), np.empty(len(points))
-            anew = np.arange(len(points))
-        bound_m = self._reach_m + MARGIN_M
-        distances, index = nearest_in(self._tree, points[anew], 2, bound_m)
-        first_m, second_m = np.minimum(distances, bound_m).T
-        self._points[anew], self._index[anew] = points[anew], index[:, 0]
-        self._slack_m[anew] = np.where(index[:, 0] < self._tree.n, 0.5 * (second_m - first_m), MARGIN_M)
-        offsets = points - self._tree.data.take(self._index, axis=0, mode="clip")
-        near = np.einsum("ij,ij->i", offsets, offsets) < self._reach_m**2
-        return np.where(near, self._index, self._tree.n)
-
-
-class Surroundings:
-    """The map around a start, in the sensor frame there, so that its features are those that a sensor there would see.
-
-    Neighbours are found by a tree on the host between jitted steps: less than a millisecond a round, where XLA on a CPU
-    needs several.
-    """
-
-    def __init__(self, local_map: LocalMap, T_world_start: np.ndarray):
-        self._seen = local_map.crop(T_world_start, CROP_M)
-        self.usable = len(self._seen.points) >= MIN_TARGETS
-        tree = tree_of(np.asarray(self._seen.points))
-        self._nearest, self._in_reach = Nearest(tree, np.inf), Nearest(tree, REACH_M)
-
-    def matches(self, source: Surfaces, T: np.ndarray) -> Surfaces:
-        """The nearest surface to each of n points at T_start_lidar, searched for anew where they have moved. The map must be usable."""
-        return self._rows(self._nearest(_moved(source, T)))
-
-    def matches_in_reach(self, source: Surfaces, T: np.ndarray) -> Surfaces:
-        """The same, and some other surface where none is within 0.8 m."""
-        return self._rows(self._in_reach(_moved(source, T)))
-
-    def _rows(self, index: np.ndarray) -> Surfaces:
-        return Surfaces(*(array.take(index, axis=0, mode="clip") for array in self._seen))
-
-
-def _moved(source: Surfaces, T: np.ndarray) -> np.ndarray:
-    return np.asarray(source.points) @ T[:3, :3].T + T[:3, 3]
 
 
 def register(
@@ -285,7 +218,7 @@ class MapTracker:
         skips = (0, NUM_LEARNED_POINTS) if recovering and num_learned else (0,)
         tries = []
         for T_since_guess in Ts_since_guess:
-            near, sweeps = Surroundings(self._map, T_world_since @ T_since_guess), [scan]
+            near, sweeps = Surroundings(self._map, T_world_since @ T_since_guess, REACH_M), [scan]
             if recovering and scan.times_s is not None:  # a guess is a velocity too, unless the sensor was carried
                 sweeps.append(scan.still(se3.log(T_since_guess) / elapsed_s))
             for sweep, skip in itertools.product(sweeps, skips):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from delo_jax.geometry import neighbors
-from delo_jax.geometry.neighbors import nearest_in, tree_meanwhile, tree_of
+from delo_jax.geometry.neighbors import Nearest, nearest_in, tree_meanwhile, tree_of
 
 
 def cloud(num, seed):
@@ -44,6 +44,22 @@ def test_tree_is_built_meanwhile(monkeypatch, cores):
     monkeypatch.setattr(neighbors, "_num_cores", lambda: cores)
     ready, points = tree_meanwhile(cloud(5000, 0)), cloud(50, 1)
     np.testing.assert_array_equal(ready().query(points)[1], tree_of(cloud(5000, 0)).query(points)[1])
+
+
+@pytest.mark.parametrize("reach_m", [0.8, np.inf])
+@pytest.mark.parametrize("step_m", [0.0, 0.01, 0.2, 5.0])
+def test_nearest_of_moving_points(reach_m, step_m):
+    """Oracle: all distances; points that move again and again, other ones now and then, some beyond reach and back."""
+    rng = np.random.default_rng(0)
+    targets = rng.uniform(-4.0, 4.0, (400, 3)).astype(np.float32)
+    search, points = Nearest(tree_of(targets), reach_m), rng.uniform(-5.0, 5.0, (700, 3)).astype(np.float32)
+    for k in range(12):
+        points = points + rng.normal(0.0, step_m, points.shape).astype(np.float32)
+        if k == 8:
+            points = points[:500]
+        distances = np.linalg.norm(points[:, None].astype(np.float64) - targets[None], axis=2)
+        expected = np.where(distances.min(axis=1) < reach_m, distances.argmin(axis=1), 400)
+        np.testing.assert_array_equal(search(points), expected)
 
 
 def _in_child(queue):

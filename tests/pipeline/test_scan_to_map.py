@@ -12,11 +12,10 @@ from scipy.spatial.transform import Rotation
 import delo_jax
 from delo_jax import inference
 from delo_jax.errors import ConfigError
-from delo_jax.geometry.neighbors import tree_of
 from delo_jax.inference import Estimate
 from delo_jax.pipeline.lidar_odometry import LidarOdometry
-from delo_jax.pipeline.local_map import LocalMap, surfaces_of
-from delo_jax.pipeline.scan_to_map import MapTracker, Nearest, Steps, Surroundings, register
+from delo_jax.pipeline.local_map import LocalMap, Surroundings, surfaces_of
+from delo_jax.pipeline.scan_to_map import REACH_M, MapTracker, Steps, register
 from tests.fixtures import errors, narrow_model, thinned
 from tests.oracles import street
 from tests.oracles.registration import hat
@@ -51,7 +50,7 @@ def street_map(num):
 
 def fixed(local_map, start, num_learned):
     """The sixth scan registered from a start."""
-    near = Surroundings(local_map, start)
+    near = Surroundings(local_map, start, REACH_M)
     return register(weights(), prepared(5), near, np.eye(4), num_learned=num_learned, num_rounds=2)
 
 
@@ -68,22 +67,6 @@ def test_scan_is_registered_to_the_map(size, num_learned):
         assert rotation_deg < 0.15
         assert fix.score > 0.4
         assert fix.rms_m < 0.05
-
-
-@pytest.mark.parametrize("reach_m", [0.8, np.inf])
-@pytest.mark.parametrize("step_m", [0.0, 0.01, 0.2, 5.0])
-def test_nearest_of_moving_points(reach_m, step_m):
-    """Oracle: all distances; points that move again and again, other ones now and then, some beyond reach and back."""
-    rng = np.random.default_rng(0)
-    targets = rng.uniform(-4.0, 4.0, (400, 3)).astype(np.float32)
-    search, points = Nearest(tree_of(targets), reach_m), rng.uniform(-5.0, 5.0, (700, 3)).astype(np.float32)
-    for k in range(12):
-        points = points + rng.normal(0.0, step_m, points.shape).astype(np.float32)
-        if k == 8:
-            points = points[:500]
-        distances = np.linalg.norm(points[:, None].astype(np.float64) - targets[None], axis=2)
-        expected = np.where(distances.min(axis=1) < reach_m, distances.argmin(axis=1), 400)
-        np.testing.assert_array_equal(search(points), expected)
 
 
 def test_wrong_place_scores_low():
