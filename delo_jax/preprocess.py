@@ -84,11 +84,10 @@ def preprocess_timed(points: np.ndarray, times_s: np.ndarray | None, cfg: Prepro
     """
     points, rng = check_points(points), np.random.default_rng(0)  # the same scan gives the same bytes
     rows = np.arange(len(points)) if cfg.sampling == "raw" else _thinned(len(points), cfg.max_raw_points, rng)
-    columns = np.empty((len(rows), 3 if times_s is None else 4), np.float32)
-    columns[:, :3] = points.take(rows, axis=0)
+    columns = points.take(rows, axis=0)
     if times_s is not None:
         times = times_s.take(rows)
-        columns[:, 3] = np.where(np.isfinite(times), times, 0.0)
+        columns = np.column_stack([columns, np.where(np.isfinite(times), times, 0.0).astype(np.float32)])
     columns = _crop(columns, cfg)
     if cfg.sampling == "raw":
         return _raw_scan(columns, cfg, rng)

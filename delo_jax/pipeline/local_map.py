@@ -107,13 +107,15 @@ class LocalMap:
         if self._voxels is None:
             nothing = np.zeros((0, 3), np.float32)
             return Surfaces(nothing, nothing, np.zeros((0, NUM_FEATURES), np.float32), np.zeros(0, bool))
-        near = self._voxels.rows(_near(self._voxels, T_world_lidar, reach_m))
-        R = T_world_lidar[:3, :3]
-        points = ((near.points - T_world_lidar[:3, 3]) @ R).astype(np.float32)
-        normals = (near.normals @ R).astype(np.float32)
+        rows, R = _near(self._voxels, T_world_lidar, reach_m), T_world_lidar[:3, :3]
+        world, normals, features = (
+            array.take(rows, axis=0) for array in (self._voxels.points, self._voxels.normals, self._voxels.features)
+        )
+        points = ((world - T_world_lidar[:3, 3]) @ R).astype(np.float32)
+        normals = (normals @ R).astype(np.float32)
         normals = np.where(np.einsum("ij,ij->i", normals, points)[:, None] > 0, -normals, normals)
         ranges = np.maximum(np.linalg.norm(points, axis=1), 1e-3)
-        return Surfaces(points, normals, posed_features(near.features, ranges, points, normals), np.ones(len(points), bool))
+        return Surfaces(points, normals, posed_features(features, ranges, points, normals), np.ones(len(points), bool))
 
 
 class Surroundings:
