@@ -11,7 +11,7 @@ is off by more than 0.5 m or 2 deg. Times hold the preparation of both scans.
 
 What a method made of a sequence is kept in `--out` by content (scans, method, version, settings): a re-run does what has changed.
 
-Run:     python experiments/benchmark.py --data TREE           (about 80 minutes on 2 cores; needs '.[baselines]')
+Run:     python experiments/benchmark.py --data TREE           (about an hour on 2 cores; needs '.[baselines]')
 Expect:  all bounds kept.
 """
 
