@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
 from delo_jax.bench.timing import NOT_BUILT, Timing
 
@@ -65,11 +64,6 @@ def in_turns(
             jax.block_until_ready(calls[name](turn))
             times.append(Timed(name, clock.now() - begin))
     return collected(times, warm_up)
-
-
-def paired_ratio(above: Timing, below: Timing) -> float:
-    """Median of the ratios of what was measured in the same turn."""
-    return float(np.median(np.divide(above.warm_ms, below.warm_ms)))
 
 
 def table(title: str, timings: Mapping[str, Timing], more: Mapping[str, str] | None = None, heading: str = "") -> str:

@@ -36,7 +36,7 @@ from rich.progress import Progress
 
 import delo_jax
 from delo_jax.baselines.protocols import NUM_THREADS
-from delo_jax.bench.timing import UNKNOWN, Timing
+from delo_jax.bench.timing import UNKNOWN, Timing, paired_ratio
 
 PARTS = ("networks", "drive", "paper")
 MOST_MS = {networks.BASE: 25.0, networks.TINY_WIDE: 10.0, networks.TINY: 10.0}
@@ -128,7 +128,7 @@ def paper_rows(found: networks.PaperSize) -> list[Row]:
     ]
     rows = []
     for above, below, bound, at_least in over:
-        ratio = turns.paired_ratio(by[above], by[below]) if {above, below} <= set(by) else UNKNOWN
+        ratio = paired_ratio(by[above], by[below]) if {above, below} <= set(by) else UNKNOWN
         rows.append(Row(f"{above} / {below}", ratio, "ratio", bound, at_least))
     rows.append(Row(f"{same} translation", found.apart_m, "m", SAME_M))
     return [*rows, Row(f"{same} rotation matrix", found.apart_rad, "", SAME_RAD)]

@@ -20,6 +20,7 @@ from delo_jax.train.presets import PRESETS
 
 LEAST_TARGET_POINTS = 3072
 BATCH = 4  # pairs of a batched call
+TOGETHER, SINGLE = "encode twice and solve", "one pair beside it"  # stages that take turns
 
 
 def sized(cfg: DeloConfig, num_points: int) -> DeloConfig:
@@ -102,11 +103,15 @@ def _device_stages(params: delo.Model, scans: list[np.ndarray], group: Group, ba
 
 
 def _batched(params: delo.Model, scans: tuple, group: Group) -> None:
-    """Both encodings and the solution, several pairs at once."""
+    """Both encodings and the solution, several pairs at once, in turns with one pair."""
     start = jnp.eye(4)
+
+    def single() -> delo.Registration:
+        return inference.solve(params, *(inference.encode(params, scan) for scan in scans), start)
 
     def one(model: delo.Model, source, target) -> delo.Registration:
         return delo.solve(model, delo.encode(model, source), delo.encode(model, target), start)
 
     stacked = [jax.tree.map(lambda array: np.stack([array] * BATCH), scan) for scan in scans]
-    group.device("encode twice and solve", jax.jit(jax.vmap(one, in_axes=(None, 0, 0))), params, *stacked, batch=BATCH)
+    together = jax.jit(jax.vmap(one, in_axes=(None, 0, 0)))
+    group.device_beside(TOGETHER, together, params, *stacked, batch=BATCH, other=SINGLE, call=single)

@@ -11,12 +11,12 @@ from importlib.metadata import version
 import jax
 
 from delo_jax import weights
-from delo_jax.bench.pair import BATCH, measure_pair
+from delo_jax.bench.pair import BATCH, SINGLE, TOGETHER, measure_pair
 from delo_jax.bench.report import Metric, Report, known, metrics_of_row
 from delo_jax.bench.roofline import Machine, best, measure_machine
 from delo_jax.bench.rows import PRODUCT, Group, LeftOut, Row
 from delo_jax.bench.streams import Groups, measure_scan_to_scan, measure_stream
-from delo_jax.bench.timing import Effort, nothing_kept
+from delo_jax.bench.timing import Effort, nothing_kept, paired_ratio
 from delo_jax.bench.training import measure_training, training_world
 from delo_jax.sim import simulate_drive
 from delo_jax.sim.drive import DRIVE_SEED
@@ -128,8 +128,9 @@ def run(settings: Settings, note: Callable[[str], None] = lambda what: None) -> 
 
 
 def ratios(rows: list[Row]) -> list[Metric]:
-    """What gates may be on: medians over each other, and over that of a matrix product in the same group."""
-    median = {(row.group, row.stage): row.timing.percentile(50) for row in rows}
+    """What gates may be on: medians over each other, or over that of a matrix product in the same group; several pairs and one by turns."""
+    timings = {(row.group, row.stage): row.timing for row in rows}
+    median = {key: timing.percentile(50) for key, timing in timings.items()}
     found = []
 
     def add(name: str, above: float, below: float, kind: str) -> None:
@@ -139,8 +140,9 @@ def ratios(rows: list[Row]) -> list[Metric]:
         if stage == "pair":
             add(f"{group}/pair over product", value, median[group, PRODUCT], "pair")
             add(f"{group}/encode over pair", median[group, "encode"], value, "encode")
-        elif stage == "encode twice and solve":
-            add(f"{group}/batched over single", value / BATCH, 2 * median[group, "encode"] + median[group, "solve"], "batched")
+        elif stage == TOGETHER:
+            ratio = paired_ratio(timings[group, TOGETHER], timings[group, SINGLE])
+            add(f"{group}/batched over single", ratio, float(BATCH), "batched")
         elif stage == "train step":
             add(f"{group}/step over product", value, median[group, PRODUCT], "step")
         elif group.endswith("stream on a map") and stage == "total":

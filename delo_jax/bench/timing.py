@@ -98,6 +98,11 @@ def cost_of(executable: Any) -> Cost:
     return Cost(float(said.get("flops", UNKNOWN)), float(said.get("bytes accessed", UNKNOWN)), peak)
 
 
+def paired_ratio(above: Timing, below: Timing) -> float:
+    """Median of the ratios of what was measured in the same turn."""
+    return float(np.median(np.divide(above.warm_ms, below.warm_ms)))
+
+
 def repeated(
     call: Callable[..., Any],
     effort: Effort,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from delo_jax.bench.timing import NOT_BUILT, Timing
+from delo_jax.bench.timing import NOT_BUILT, Timing, paired_ratio
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts import their neighbours
@@ -52,13 +52,13 @@ def test_calls_take_turns_on_the_same_scans():
     np.testing.assert_allclose(found["slow"].warm_ms, [600.0, 800.0, 1000.0])
     np.testing.assert_allclose(found["fast"].warm_ms, [300.0, 400.0, 500.0])
     np.testing.assert_allclose(found["fast"].first_ms, 100.0)
-    np.testing.assert_allclose(turns.paired_ratio(found["slow"], found["fast"]), 2.0)
+    np.testing.assert_allclose(paired_ratio(found["slow"], found["fast"]), 2.0)
 
 
 def test_a_ratio_of_turns_forgets_one_that_was_disturbed():
     """Oracle: by hand; the ratios are 2, 5 and 2, while those of the medians are 5 and 1."""
     below, above = (Timing(NOT_BUILT, 0.0, values) for values in ((1.0, 1.0, 3.0), (2.0, 5.0, 6.0)))
-    assert turns.paired_ratio(above, below) == 2.0
+    assert paired_ratio(above, below) == 2.0
 
 
 def test_dense_products_are_the_loop_that_scales_rows_and_columns():
