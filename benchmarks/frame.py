@@ -24,6 +24,7 @@ from delo_jax import inference, preprocess
 from delo_jax.bench.suite import device_line
 from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.pipeline.local_map import LocalMap, Surroundings
+from delo_jax.pipeline.scan_to_map import MapTracker
 from delo_jax.sim import simulate_drive
 
 SEED, NUM_SCANS, WARM_UP, NUM_QUICK = 1_740_000, 120, 20, 25
@@ -32,8 +33,8 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "voxels": [(preprocess, "voxel_mean"), (preprocess, "one_per_voxel")],
     "planes and features": [(preprocess, "_describe")],
     "points that are kept, key points": [(preprocess, "_select"), (preprocess, "_keypoints")],
-    "map around the prediction, its tree": [(Surroundings, "__init__")],
-    "search for matches": [(Surroundings, "matches"), (Surroundings, "matches_in_reach")],
+    "map around the prediction, its tree": [(MapTracker, "_around")],
+    "search for matches": [(Surroundings, "matches"), (Surroundings, "planes_in_reach")],
     "learned steps": [(inference, "fine_step")],
     "classical steps": [(inference, "robust_steps")],
     "classical steps with the velocity": [(inference, "sweep_steps")],

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from delo_jax.config import NUM_FEATURES, PreprocessConfig
 from delo_jax.errors import ScanError
 from delo_jax.geometry.deskew import sweep_poses
-from delo_jax.geometry.neighbors import nearest_in, tree_meanwhile
+from delo_jax.geometry.neighbors import meanwhile, nearest_in, tree_of
 from delo_jax.geometry.normals import plane_fit
 
 MIN_NEIGHBORS = 5  # a plane through fewer points says nothing
@@ -92,7 +92,7 @@ def preprocess_timed(points: np.ndarray, times_s: np.ndarray | None, cfg: Prepro
     if cfg.sampling == "raw":
         return _raw_scan(columns, cfg, rng)
     cloud = voxel_mean(columns, cfg.voxel_m)
-    tree = tree_meanwhile(cloud[:, :3])
+    tree = meanwhile(tree_of, cloud[:, :3])
     rows = one_per_voxel(cloud, cfg.point_voxel_m, rng)[: 2 * cfg.max_points]
     centers, normals, features, valid = _describe(np.ascontiguousarray(cloud[:, :3]), tree, rows, cfg)
     kept = _select(normals, valid, cfg, rng)
@@ -178,7 +178,7 @@ def _by_voxel(points: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
         keys = voxel_keys(points, size)
         rows = np.argsort(keys, kind="stable")
         keys = keys[rows]
-    return rows, np.flatnonzero(np.r_[len(keys) > 0, keys[1:] != keys[:-1]])
+    return rows, np.r_[np.zeros(min(len(keys), 1), np.int64), np.flatnonzero(keys[1:] != keys[:-1]) + 1]
 
 
 def voxel_mean(columns: np.ndarray, size: float) -> np.ndarray:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from delo_jax import preprocess as pre
 from delo_jax.config import PreprocessConfig
 from delo_jax.geometry import se3
-from delo_jax.geometry.neighbors import tree_meanwhile
+from delo_jax.geometry.neighbors import meanwhile, tree_of
 from delo_jax.geometry.se3 import full_float32
 from delo_jax.model import delo, fine
 from delo_jax.model.coarse import CoarsePose, point_information
@@ -50,7 +50,7 @@ def crop_and_voxels(points: np.ndarray, cfg: PreprocessConfig) -> Voxels:
 
 def normals_and_features(voxels: Voxels, cfg: PreprocessConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Second half: points, normals and features that are kept, and the rows of the key points, without padding."""
-    centers, normals, features, valid = pre._describe(voxels.cloud, tree_meanwhile(voxels.cloud), voxels.rows, cfg)
+    centers, normals, features, valid = pre._describe(voxels.cloud, meanwhile(tree_of, voxels.cloud), voxels.rows, cfg)
     kept = pre._select(normals, valid, cfg, voxels.rng)
     points, normals = centers[kept], normals[kept]
     return points, normals, features[kept], pre._keypoints(points, normals, cfg, voxels.rng)

@@ -1,8 +1,13 @@
 """Nearest points by a tree on the host, searched for on several cores at a time."""
 
+import contextlib
+import ctypes
 import os
+import sys
+import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,15 +18,48 @@ MAX_PARTS = 4
 MIN_PART = 768  # points: fewer are not worth another thread
 MARGIN_M = 0.2  # beyond the reach that is searched, too, so that what comes into reach is known beforehand
 ROUNDING_M = 1e-6
-_helpers: ThreadPoolExecutor
+T = TypeVar("T")
+
+
+class Helpers:
+    """Threads that are kept, on other cores than the one that asks them.
+
+    Linux takes the halted core of a virtual machine for one that is busy elsewhere, and would let a thread that wakes wait for its
+    waker's own core. Threads start when they are first needed.
+    """
+
+    def __init__(self):
+        self._ids: list[int] = []
+        self._pool = ThreadPoolExecutor(MAX_PARTS - 1, "neighbors", lambda: self._ids.append(threading.get_native_id()))
+        self._cores: set[int] = set()
+        self._num_placed = 0  # on these cores
+
+    def submit(self, call: Callable[..., Any], *args: Any, **options: Any) -> Future:
+        """The call, under way on another core."""
+        if _core is not None:
+            self._place(os.sched_getaffinity(0) - {_core()})
+        return self._pool.submit(call, *args, **options)
+
+    def _place(self, cores: set[int]) -> None:
+        num = len(self._ids)
+        if cores and (cores != self._cores or num > self._num_placed):
+            with contextlib.suppress(OSError):  # no such right
+                for thread in self._ids[:num]:
+                    os.sched_setaffinity(thread, cores)
+            self._cores, self._num_placed = cores, num
 
 
 def _new_helpers() -> None:
-    """Threads start when they are first needed; a forked process has none of its parent's."""
+    """A forked process has no thread of its parent's."""
     global _helpers
-    _helpers = ThreadPoolExecutor(MAX_PARTS - 1, thread_name_prefix="neighbors")
+    _helpers = Helpers()
 
 
+_core: Callable[[], int] | None = None
+if sys.platform == "linux":
+    with contextlib.suppress(AttributeError, OSError):
+        _core = ctypes.CDLL(None).sched_getcpu
+_helpers: Helpers
 _new_helpers()
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_new_helpers)
@@ -32,12 +70,12 @@ def tree_of(points: Float[np.ndarray, "m 3"]) -> cKDTree:
     return cKDTree(points, leafsize=LEAF_SIZE, balanced_tree=False, compact_nodes=False)
 
 
-def tree_meanwhile(points: Float[np.ndarray, "m 3"]) -> Callable[[], cKDTree]:
-    """The same, built on another core while this thread goes on; call what is returned to have it."""
+def meanwhile(call: Callable[..., T], *args: Any) -> Callable[[], T]:
+    """A call that goes on another core while this thread goes on; call what is returned to have its result."""
     if _num_cores() > 1:
-        return _helpers.submit(tree_of, points).result
-    tree = tree_of(points)
-    return lambda: tree
+        return _helpers.submit(call, *args).result
+    result = call(*args)
+    return lambda: result
 
 
 def nearest_in(

@@ -36,19 +36,22 @@ def _cross(a, b):
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def _longest(vectors):
-    """Of several planar vectors (3, m, n) the longest per column (3, n), and its squared length (n,)."""
-    length2 = np.sum(vectors * vectors, axis=0)
-    best = np.argmax(length2, axis=0)
-    columns = np.arange(length2.shape[1])
-    return vectors[:, best, columns], length2[best, columns]
+def _longest(first, *others):
+    """Of several planar vectors (3, n) the longest per column, and its squared length (n,)."""
+    longest, longest2 = first.copy(), np.sum(first * first, axis=0)
+    for vectors in others:
+        length2 = np.sum(vectors * vectors, axis=0)
+        longer = length2 > longest2
+        np.copyto(longest, vectors, where=longer)
+        np.copyto(longest2, length2, where=longer)
+    return longest, longest2
 
 
 def _least_direction(least, xx, xy, xz, yy, yz, zz):
     """Unit eigenvectors (3, n) of eigenvalue `least`: the row space of M - least I is what they are normal to."""
     a, b, c = np.stack([xx - least, xy, xz]), np.stack([xy, yy - least, yz]), np.stack([xz, yz, zz - least])
-    row, row2 = _longest(np.stack([a, b, c], axis=1))
-    normal, normal2 = _longest(np.stack([_cross(a, b), _cross(b, c), _cross(c, a)], axis=1))
+    row, row2 = _longest(a, b, c)
+    normal, normal2 = _longest(_cross(a, b), _cross(b, c), _cross(c, a))
     # Points on a line leave one usable row: any direction normal to it will do.
     line = normal2 <= 1e-20 * row2 * row2
     axis = np.eye(3)[np.argmin(np.abs(row[:, line]), axis=0)].T

@@ -241,3 +241,9 @@ def rotation_angle(R: Float[AnyArray, "*b 3 3"]) -> Float[AnyArray, "*b"]:
     positive = sin2 > 0
     twice_sin = xp.where(positive, xp.sqrt(xp.where(positive, sin2, 1.0)), 0.0)
     return xp.asarray(xp.arctan2(twice_sin, R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0))
+
+
+def is_within(T_a: Float[np.ndarray, "4 4"], T_b: Float[np.ndarray, "4 4"], distance_m: float, angle_deg: float) -> bool:
+    """Whether two poses are nearer to each other than a distance and an angle; on the host."""
+    apart = inverse(T_a) @ T_b
+    return bool(np.linalg.norm(apart[:3, 3]) < distance_m and rotation_angle(apart[:3, :3]) < np.radians(angle_deg))

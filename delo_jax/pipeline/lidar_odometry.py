@@ -137,6 +137,7 @@ class LidarOdometry:
         points, stamp_ns = check_points(points), self._check_stamp(stamp_ns)
         times_s = checked_times(times_s if self._deskew else None, len(points))
         begin = time.perf_counter()
+        self._look_ahead(stamp_ns)
         scan = self._prepare(self._params, points, times_s).still(self._motion_model.velocity)
         target = Source(scan, stamp_ns, self._num_frames)
         prepared = time.perf_counter()
@@ -157,6 +158,14 @@ class LidarOdometry:
     def trajectory(self) -> Trajectory:
         """All frames so far."""
         return self._trajectory
+
+    def _look_ahead(self, stamp_ns: int) -> None:
+        """What can be made of the map before the scan is prepared."""
+        if self._map is None or self._anchor is None:
+            return
+        elapsed_s = (stamp_ns - self._anchor.source.stamp_ns) * NANOSECOND
+        if self._motion_model.can_tell(elapsed_s):
+            self._map.expect(self._anchor.T_world_lidar @ self._motion_model.predict(elapsed_s))
 
     def _check_stamp(self, stamp_ns: int | None) -> int:
         return checked_stamp(stamp_ns, self._last_stamp_ns if self._num_frames else None)

@@ -1,12 +1,13 @@
 """The local map: surfaces seen lately, one per voxel, around the sensor. Host code."""
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
 
 from delo_jax.config import NUM_FEATURES
 from delo_jax.geometry import se3
-from delo_jax.geometry.neighbors import Nearest, tree_of
+from delo_jax.geometry.neighbors import Nearest, meanwhile, tree_of
 from delo_jax.model.delo import Surfaces
 from delo_jax.preprocess import Scan, posed_features, voxel_keys
 
@@ -127,25 +128,32 @@ class Surroundings:
     Args:
         local_map: the map.
         T_world_start: (4, 4) where the sensor is expected.
-        reach_m: of `matches_in_reach`.
+        reach_m: of `planes_in_reach`.
     """
 
     def __init__(self, local_map: LocalMap, T_world_start: np.ndarray, reach_m: float):
         self._seen = local_map.crop(T_world_start, CROP_M)
         self.usable = len(self._seen.points) >= MIN_TARGETS
-        tree = tree_of(np.asarray(self._seen.points))
-        self._nearest, self._in_reach = Nearest(tree, np.inf), Nearest(tree, reach_m)
+        self._tree, self._reach_m = meanwhile(tree_of, np.asarray(self._seen.points)), reach_m
+
+    @functools.cached_property
+    def _nearest(self) -> Nearest:
+        return Nearest(self._tree(), np.inf)
+
+    @functools.cached_property
+    def _in_reach(self) -> Nearest:
+        return Nearest(self._tree(), self._reach_m)
 
     def matches(self, source: Surfaces, T: np.ndarray) -> Surfaces:
         """The nearest surface to each of n points at T_start_lidar, searched for anew where they have moved. The map must be usable."""
-        return self._rows(self._nearest(_moved(source, T)))
-
-    def matches_in_reach(self, source: Surfaces, T: np.ndarray) -> Surfaces:
-        """The same, and some other surface where none is within reach."""
-        return self._rows(self._in_reach(_moved(source, T)))
-
-    def _rows(self, index: np.ndarray) -> Surfaces:
+        index = self._nearest(_moved(source, T))
         return Surfaces(*(array.take(index, axis=0, mode="clip") for array in self._seen))
+
+    def planes_in_reach(self, source: Surfaces, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Point and normal, each (n, 3), of the same; of some other surface where none is within reach."""
+        index = self._in_reach(_moved(source, T))
+        points, normals = (np.asarray(array).take(index, axis=0, mode="clip") for array in self._seen[:2])
+        return points, normals
 
 
 def _moved(source: Surfaces, T: np.ndarray) -> np.ndarray:

@@ -11,8 +11,7 @@ MAX_GAP = 3.5  # times the last one
 
 def is_near(T_expected: np.ndarray, T_found: np.ndarray) -> bool:
     """Whether a motion is what the expected one could have become: a vehicle does not jump."""
-    apart = se3.inverse(T_expected) @ T_found
-    return bool(np.linalg.norm(apart[:3, 3]) < SURPRISE_M and se3.rotation_angle(apart[:3, :3]) < np.radians(SURPRISE_DEG))
+    return se3.is_within(T_expected, T_found, SURPRISE_M, SURPRISE_DEG)
 
 
 class ConstantVelocity:

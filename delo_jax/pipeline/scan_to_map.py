@@ -111,7 +111,7 @@ def register(
             return NOWHERE
     source, fix = surfaces_of(scan.scan), NOWHERE
     for num_steps in [ROBUST_STEPS] * num_rounds or [0]:
-        fit = _robust(source, near.matches_in_reach(source, T), T, num_steps)
+        fit = _robust(source, near.planes_in_reach(source, T), T, num_steps)
         fix, T = _fix_of(fit), np.asarray(fit.T_target_source)
         if fix is NOWHERE:
             break
@@ -150,13 +150,12 @@ def register_sweep(scan: PreparedScan, near: Surroundings, fix: MapFix, velocity
 
 def _sweep(scan: PreparedScan, near: Surroundings, T: np.ndarray, velocity_prior: np.ndarray) -> SweepFit:
     source = surfaces_of(scan.scan)
-    matched = near.matches_in_reach(source, T)
-    rows = source.points, source.normals, source.mask, scan.times_s, matched.points, matched.normals
+    rows = source.points, source.normals, source.mask, scan.times_s, *near.planes_in_reach(source, T)
     return jax.device_get(inference.sweep_steps(*rows, T, velocity_prior.astype(np.float32), **SWEEP_OPTIONS))
 
 
-def _robust(source: Surfaces, matched: Surfaces, T: np.ndarray, num_steps: int) -> RobustFit:
-    rows = source.points, source.normals, source.mask, matched.points, matched.normals
+def _robust(source: Surfaces, planes: tuple[np.ndarray, np.ndarray], T: np.ndarray, num_steps: int) -> RobustFit:
+    rows = source.points, source.normals, source.mask, *planes
     return jax.device_get(inference.robust_steps(*rows, T, scale_m=SCALE_M, reach_m=REACH_M, num_steps=num_steps))
 
 
@@ -178,6 +177,7 @@ class MapTracker:
         self._inserted_at: np.ndarray | None = None
         self._numbers, self._swing = stream.StreamNoise.of(params.variables), stream.STEADY
         self._stamp_sigma_s = stamp_sigma_s
+        self._expected: tuple[np.ndarray, Surroundings] | None = None
 
     @property
     def calibrated(self) -> bool:
@@ -186,16 +186,24 @@ class MapTracker:
 
     def restart(self, scan: PreparedScan, T_world_lidar: np.ndarray) -> None:
         """A new map that begins with this scan."""
-        self._map, self._inserted_at, self._swing = LocalMap(), None, stream.STEADY
+        self._map, self._inserted_at, self._swing, self._expected = LocalMap(), None, stream.STEADY, None
         self._scores.clear()
         self.insert(scan, T_world_lidar)
 
+    def expect(self, T_world_lidar: np.ndarray) -> None:
+        """The next scan is expected here: the tree of the map around it grows while the scan is prepared."""
+        self._expected = T_world_lidar, Surroundings(self._map, T_world_lidar, REACH_M)
+
+    def _around(self, T_world_lidar: np.ndarray) -> Surroundings:
+        if self._expected is not None and np.array_equal(self._expected[0], T_world_lidar):
+            return self._expected[1]
+        return Surroundings(self._map, T_world_lidar, REACH_M)
+
     def insert(self, scan: PreparedScan, T_world_lidar: np.ndarray) -> bool:
         """Take in a scan, once a metre or so; whether it was taken in."""
-        if self._inserted_at is not None:
-            moved = se3.inverse(self._inserted_at) @ T_world_lidar
-            if np.linalg.norm(moved[:3, 3]) < INSERT_M and se3.rotation_angle(moved[:3, :3]) < np.radians(INSERT_DEG):
-                return False
+        if self._inserted_at is not None and se3.is_within(self._inserted_at, T_world_lidar, INSERT_M, INSERT_DEG):
+            return False
+        self._expected = None
         self._map.insert(surfaces_of(scan.scan), T_world_lidar)
         self._map.prune(T_world_lidar)
         self._inserted_at = T_world_lidar
@@ -218,7 +226,7 @@ class MapTracker:
         skips = (0, NUM_LEARNED_POINTS) if recovering and num_learned else (0,)
         tries = []
         for T_since_guess in Ts_since_guess:
-            near, sweeps = Surroundings(self._map, T_world_since @ T_since_guess, REACH_M), [scan]
+            near, sweeps = self._around(T_world_since @ T_since_guess), [scan]
             if recovering and scan.times_s is not None:  # a guess is a velocity too, unless the sensor was carried
                 sweeps.append(scan.still(se3.log(T_since_guess) / elapsed_s))
             for sweep, skip in itertools.product(sweeps, skips):

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 
 from delo_jax.data.fields import RawScan
+from delo_jax.geometry import se3
 from delo_jax.inference import PreparedScan
 
 SLOT_BITS = 21
@@ -16,6 +17,9 @@ MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.
 SHIFT = np.uint64(64 - SLOT_BITS)
 COARSER = np.sqrt(2.0)
 """Surfaces keep half of their points in voxels that are so much larger."""
+
+SPACING_M, SPACING_DEG = 1.0, 5.0
+"""Motion since the last scan that was taken in: what is seen in between is hardly new."""
 
 MAX_RAW_POINTS = 4096
 """Of a raw scan."""
@@ -47,6 +51,7 @@ class DriveCloud:
         self._taken = np.zeros(SLOTS, bool)
         self._parts: list[np.ndarray] = []  # (k, 7) float32 each: sensor frame, world frame, number of the scan
         self._count = 0
+        self._taken_at: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Points kept so far."""
@@ -72,7 +77,10 @@ class DriveCloud:
             self._coarsen(COARSER)
 
     def add_scan(self, number: int, T_world_lidar: np.ndarray, scan: PreparedScan | RawScan) -> None:
-        """Takes what is new in a scan as it was registered, or in an even share of a raw one."""
+        """Takes what is new in a scan as it was registered, or in an even share of a raw one; once a metre or so."""
+        if self._taken_at is not None and se3.is_within(self._taken_at, T_world_lidar, SPACING_M, SPACING_DEG):
+            return
+        self._taken_at = T_world_lidar
         if isinstance(scan, RawScan):
             self.add(number, scan.points[:: 1 + len(scan.points) // MAX_RAW_POINTS], T_world_lidar)
         else:

@@ -1,13 +1,15 @@
 """Searches for nearest points by a tree on several cores."""
 
 import multiprocessing
+import os
 import sys
+import threading
 
 import numpy as np
 import pytest
 
 from delo_jax.geometry import neighbors
-from delo_jax.geometry.neighbors import Nearest, nearest_in, tree_meanwhile, tree_of
+from delo_jax.geometry.neighbors import Nearest, meanwhile, nearest_in, tree_of
 
 
 def cloud(num, seed):
@@ -42,8 +44,20 @@ def test_one_neighbour_is_one_column_less():
 def test_tree_is_built_meanwhile(monkeypatch, cores):
     """Oracle: the tree that is built at once."""
     monkeypatch.setattr(neighbors, "_num_cores", lambda: cores)
-    ready, points = tree_meanwhile(cloud(5000, 0)), cloud(50, 1)
+    ready, points = meanwhile(tree_of, cloud(5000, 0)), cloud(50, 1)
     np.testing.assert_array_equal(ready().query(points)[1], tree_of(cloud(5000, 0)).query(points)[1])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads are placed on Linux alone")
+def test_threads_keep_clear_of_the_core_that_asks(monkeypatch):
+    """Oracle: what the operating system says of a thread, for two cores that ask in turn."""
+    allowed, helpers = os.sched_getaffinity(0), neighbors.Helpers()
+    together = threading.Barrier(neighbors.MAX_PARTS - 1, timeout=60.0)
+    for waiting in [helpers.submit(together.wait) for _ in range(neighbors.MAX_PARTS - 1)]:  # all threads have started then
+        waiting.result()
+    for core in sorted(allowed)[:2]:
+        monkeypatch.setattr(neighbors, "_core", lambda core=core: core)
+        assert helpers.submit(os.sched_getaffinity, 0).result() == (allowed - {core} or allowed)
 
 
 @pytest.mark.parametrize("reach_m", [0.8, np.inf])

@@ -133,6 +133,15 @@ def test_exp_and_log_under_jit_and_vmap():
     np.testing.assert_allclose(se3.exp(xi.reshape(2, 2, 6)).reshape(4, 4, 4), se3.exp(xi), atol=1e-6)
 
 
+@pytest.mark.parametrize(("distance_m", "angle_deg", "within"), [(1.01, 5.1, True), (0.99, 5.1, False), (1.01, 4.9, False)])
+def test_nearness_of_poses(distance_m, angle_deg, within):
+    """Oracle: by hand: 1 m and 5 deg apart, wherever the first one is."""
+    apart = np.eye(4)
+    apart[:3, :3], apart[:3, 3] = Rotation.from_rotvec(np.radians([3.0, 0.0, 4.0])).as_matrix(), [0.6, 0.0, -0.8]
+    T = random_pose(0)
+    assert se3.is_within(T, T @ apart, distance_m, angle_deg) == within
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_group_operations(seed):
     """Oracle: gtsam Pose3 (inverse, AdjointMap, transformFrom), NumPy cross product."""

@@ -3,6 +3,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from delo_jax.data.fields import RawScan
 from delo_jax.report.cloud import DriveCloud
 
 
@@ -72,3 +73,17 @@ def test_unusable_points_are_left_out():
     cloud.add(0, points, np.eye(4))
     cloud.add(1, points[:0], np.eye(4))
     np.testing.assert_allclose(cloud.placed(poses(2)).points, [[10.0, 0.0, 0.0]])
+
+
+def test_a_scan_a_metre():
+    """Oracle: by hand: scans every 40 cm, of which the first, the fourth (1.2 m on) and the seventh count, and a turn on the spot."""
+    rng, cloud = np.random.default_rng(3), DriveCloud(voxel_m=1e-3, range_m=(0.0, 100.0))
+    Ts = np.tile(np.eye(4), (8, 1, 1))
+    Ts[:7, 0, 3], Ts[7] = 0.4 * np.arange(7), Ts[6]
+    Ts[7, :3, :3] = Rotation.from_euler("z", 6.0, degrees=True).as_matrix()
+    counts = []
+    for number, T in enumerate(Ts):
+        before = len(cloud)
+        cloud.add_scan(number, T, RawScan(points=walls(rng, 50), times=None))
+        counts.append(len(cloud) - before)
+    assert [count > 0 for count in counts] == [True, False, False, True, False, False, True, True]
