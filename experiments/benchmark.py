@@ -36,6 +36,7 @@ from delo_jax.metrics.ate import absolute_errors
 from delo_jax.metrics.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift, Segments, joined, mean_drift, segment_errors
 from delo_jax.model.delo import Model
 from delo_jax.pipeline.baseline_odometry import BaselineOdometry
+from delo_jax.pipeline.lidar_odometry import LidarOdometry
 
 SEQUENCES = ("odo_00_056", "odo_04_000", "raw_0926_0013")
 OURS, NO_MAP = "delo", "delo, no map"
@@ -69,15 +70,18 @@ def entries(names: list[str], params: Model, given: dict[str, str]) -> dict[str,
         stamp = f"{source_hash(OWN if method.network else OTHERS)} {method.package_version} {digest}"
         opened = () if model is None else (model,)
         if name == OURS:
-            found[name] = Entry(stamp, functools.partial(delo_jax.LidarOdometry, params), functools.partial(method.open_pair, params))
-            found[NO_MAP] = Entry(stamp, functools.partial(delo_jax.LidarOdometry, params, use_map=False), None)
+            found[name] = Entry(stamp, functools.partial(LidarOdometry, params), functools.partial(method.open_pair, params))
+            found[NO_MAP] = Entry(stamp, functools.partial(LidarOdometry, params, use_map=False), None)
         else:
-            tracker = None if method.tracker is None or name in PAIRS_ONLY else functools.partial(_tracked, name, opened)
+            tracker = None if name in PAIRS_ONLY else functools.partial(_tracked, name, opened)
             found[name] = Entry(stamp, tracker, None if method.pair is None else functools.partial(method.open_pair, *opened))
     return found
 
 
-def _tracked(name: str, opened: tuple) -> BaselineOdometry:
+def _tracked(name: str, opened: tuple) -> BaselineOdometry | LidarOdometry:
+    """A method along a drive; one without a tracker is `LidarOdometry` with its own weights, which have no fine stage for a map."""
+    if METHODS[name].tracker is None:
+        return LidarOdometry(*opened, use_map=False)
     return BaselineOdometry(METHODS[name].open_tracker(*opened))
 
 

@@ -248,6 +248,19 @@ def test_network_without_a_head_says_that_it_knows_nothing():
     assert not np.allclose(estimate.T_target_source, START)
 
 
+@pytest.mark.parametrize("preset", ["paper", "official"])
+def test_published_network_stands_however_unsure(monkeypatch, preset):
+    """Oracle: the solver's own pose; the paper leaves no pose out by its confidence, which says what the pose graph may take."""
+    model = narrow_model(preset)
+    limits = dataclasses.replace(model.cfg.status, min_points=10, min_observability=0.0)
+    model = delo.Model(model.variables, dataclasses.replace(model.cfg, status=limits))
+    monkeypatch.setattr(inference, "solve", lambda *args: solve(*args)._replace(confidence=np.float32(0.0)))
+    estimate = odometry(model, street_points(0), street_points(1), T_target_source_init=START)
+    assert (estimate.status, estimate.confidence) == ("low_confidence", 0.0)
+    found = solve(model, *(prepare(model, street_points(frame)).encoding for frame in (0, 1)), START.astype(np.float32))
+    np.testing.assert_allclose(estimate.T_target_source, found.T_target_source, atol=1e-5)
+
+
 def test_evidence_of_embeddings_becomes_a_covariance():
     """Oracle: Monte Carlo. Poses drawn as independent angles and translations of the head's variances, relative to the estimate.
 

@@ -11,6 +11,7 @@ from delo_jax.config import (
     MatchingConfig,
     PoseConfig,
     PreprocessConfig,
+    StatusConfig,
     TrainConfig,
 )
 
@@ -25,6 +26,7 @@ _PAPER_MODEL = DeloConfig(
     pose=PoseConfig(solver="procrustes"),
     fine=FineConfig(num_iters=0),
     evidence=EvidenceConfig(head="embedding"),
+    status=StatusConfig(ok_confidence=0.2, rejected_confidence=0.0),  # theta_min; the paper takes every pose, however unsure
 )
 _PAPER = TrainConfig(
     model=_PAPER_MODEL,
