@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike
 
 from delo_jax.errors import ScanError
 from delo_jax.geometry import se3
+from delo_jax.geometry.deskew import Sweep
 from delo_jax.geometry.point_to_plane import robust_point_to_plane, robust_sweep_to_plane
 from delo_jax.model import delo
-from delo_jax.preprocess import Scan, check_points, preprocess_timed, still
+from delo_jax.preprocess import Scan, check_points, preprocess_timed, still, sweep_of_scan
 from delo_jax.uncertainty import covariance, status
 from delo_jax.uncertainty.observability import observability
 
@@ -86,6 +87,8 @@ class PreparedScan:
     """The same as measured by the moving sensor."""
     times_s: np.ndarray | None
     """(m,) of its points, relative to the stamp; None where the points carry none."""
+    sweep: Sweep | None = None
+    """The instants of these times; kept from the first de-skew on."""
 
     @functools.cached_property
     def num_points(self) -> int:
@@ -101,7 +104,8 @@ class PreparedScan:
         """The scan de-skewed with a body velocity (6,) [omega rad/s, v m/s]; as measured where that or the times are not known."""
         if self.times_s is None or velocity is None:
             return self
-        return dataclasses.replace(self, scan=still(self.measured, self.times_s, velocity))
+        sweep = self.sweep or sweep_of_scan(self.measured, self.times_s)
+        return dataclasses.replace(self, scan=still(self.measured, sweep, velocity), sweep=sweep)
 
 
 def prepare(params: delo.Model, points: ArrayLike, times_s: np.ndarray | None = None) -> PreparedScan:

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from delo_jax.config import NUM_FEATURES, PreprocessConfig
 from delo_jax.errors import ScanError
-from delo_jax.geometry.deskew import sweep_poses
+from delo_jax.geometry.deskew import Sweep, sweep_of, sweep_poses
 from delo_jax.geometry.neighbors import meanwhile, nearest_in, tree_of
 from delo_jax.geometry.normals import plane_fit
 
@@ -109,19 +109,22 @@ def preprocess_timed(points: np.ndarray, times_s: np.ndarray | None, cfg: Prepro
     return scan, None if times_s is None else _pad(cloud[rows[kept], 3], cfg.max_points)
 
 
-def still(scan: Scan, times_s: np.ndarray, velocity: np.ndarray) -> Scan:
+def sweep_of_scan(scan: Scan, times_s: np.ndarray) -> Sweep:
+    """When the points of a scan were measured, from their (m,) times relative to the stamp [s]; padding does not widen the sweep."""
+    return sweep_of(np.where(scan.mask, times_s, times_s[0]) if scan.mask.any() else times_s)
+
+
+def still(scan: Scan, sweep: Sweep, velocity: np.ndarray) -> Scan:
     """A scan as measured, de-skewed: points and normals in the sensor frame at the stamp.
 
     Features stay: what a surface is like does not change, and its range and height hardly do.
 
     Args:
         scan: of NumPy arrays.
-        times_s: (m,) of its points, relative to the stamp.
+        sweep: when its points were measured.
         velocity: (6,) of the body, [omega rad/s, v m/s].
     """
-    if scan.mask.any():  # padding must not widen the sweep
-        times_s = np.where(scan.mask, times_s, times_s[0])
-    poses = sweep_poses(times_s, velocity)
+    poses = sweep_poses(sweep, velocity)
     points = np.einsum("nij,nj->ni", poses[:, :3, :3], scan.points) + np.where(scan.mask[:, None], poses[:, :3, 3], np.float32(0.0))
     normals = np.einsum("nij,nj->ni", poses[:, :3, :3], scan.normals) if len(scan.normals) else scan.normals
     return scan._replace(points=points, normals=normals)

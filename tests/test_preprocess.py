@@ -14,7 +14,7 @@ from scipy.stats import ks_2samp
 
 from delo_jax.config import PreprocessConfig
 from delo_jax.errors import ScanError
-from delo_jax.preprocess import HORIZONTAL, NUM_FEATURES, one_per_voxel, preprocess, preprocess_timed, still, voxel_mean
+from delo_jax.preprocess import HORIZONTAL, NUM_FEATURES, one_per_voxel, preprocess, preprocess_timed, still, sweep_of_scan, voxel_mean
 from tests.fixtures import simulated_clip
 from tests.oracles import street
 from tests.oracles.registration import hat
@@ -235,7 +235,7 @@ def test_still_scan_is_the_scan_of_a_sensor_at_rest():
     points = street.scan(street.pose(), noise_m=0.01).points
     scan, times_s = preprocess_timed(points, 0.05 * np.sin(np.arange(len(points))), CFG)
     velocity = np.array([0.1, -0.2, 0.5, 12.0, 0.3, -0.1])
-    found = still(scan, times_s, velocity)
+    found = still(scan, sweep_of_scan(scan, times_s), velocity)
     for row in range(0, int(scan.mask.sum()), 37):
         T = expm(hat(velocity * times_s[row]))
         np.testing.assert_allclose(found.points[row], T[:3, :3] @ scan.points[row] + T[:3, 3], atol=0.03)
@@ -250,7 +250,7 @@ def test_padding_does_not_widen_a_sweep():
     scan, times_s = preprocess_timed(points, -0.9 + 0.05 * np.sin(np.arange(len(points))), CFG)
     assert not scan.mask.all()
     velocity = np.array([0.0, 0.0, 0.0, 40.0, 0.0, 0.0])
-    found = still(scan, times_s, velocity)
+    found = still(scan, sweep_of_scan(scan, times_s), velocity)
     moved = scan.points[scan.mask] + times_s[scan.mask, None] * velocity[None, 3:]
     assert np.abs(found.points[scan.mask] - moved).max() < 0.02
 

@@ -14,7 +14,7 @@ import numpy as np
 from delo_jax.config import PreprocessConfig, TrainConfig
 from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.geometry import se3
-from delo_jax.preprocess import Scan, preprocess, preprocess_timed, still
+from delo_jax.preprocess import Scan, preprocess, preprocess_timed, still, sweep_of_scan
 from delo_jax.sim import KINDS, SimulatedScan, simulate_clip
 
 SIMULATOR = 3  # counts the changes of `delo_jax.sim`, `preprocess` and here that change a world; stored worlds of another are not used
@@ -83,7 +83,7 @@ def _world_scan(scan: SimulatedScan, velocity: np.ndarray | None, cfg: Preproces
     if velocity is None or not np.any(scan.times_s):
         return preprocess(scan.points, cfg)
     prepared, times_s = preprocess_timed(scan.points, scan.times_s, cfg)
-    return prepared if times_s is None else still(prepared, times_s, velocity)
+    return prepared if times_s is None else still(prepared, sweep_of_scan(prepared, times_s), velocity)
 
 
 def worlds(cfg: TrainConfig, folder: Path, *, validation: bool, on_world: Callable[[], None] = lambda: None) -> Iterator[World]:
