@@ -33,7 +33,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "voxels": [(preprocess, "voxel_mean"), (preprocess, "one_per_voxel")],
     "planes and features": [(preprocess, "_describe")],
     "points that are kept, key points": [(preprocess, "_select"), (preprocess, "_keypoints")],
-    "map around the prediction, its tree": [(MapTracker, "_around")],
+    "map around the prediction": [(MapTracker, "expect"), (MapTracker, "_around")],  # its tree grows meanwhile
     "search for matches": [(Surroundings, "matches"), (Surroundings, "planes_in_reach")],
     "learned steps": [(inference, "fine_step")],
     "classical steps": [(inference, "robust_steps")],

@@ -66,7 +66,7 @@ def entries(names: list[str], params: Model, given: dict[str, str]) -> dict[str,
         except DeloError as error:
             print(f"left out: {error}", file=sys.stderr)
             continue
-        digest = "" if model is None else weights.read_card(given.get(name, "delo-base"))["sha256"]
+        digest = "" if model is None else f"{weights.read_card(given.get(name, 'delo-base'))['sha256']} {model.cfg}"
         stamp = f"{source_hash(OWN if method.network else OTHERS)} {method.package_version} {digest}"
         opened = () if model is None else (model,)
         if name == OURS:
