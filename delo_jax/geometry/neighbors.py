@@ -18,7 +18,7 @@ MAX_PARTS = 4
 MIN_PART = 768  # points: fewer are not worth another thread
 MARGIN_M = 0.2  # beyond the reach that is searched, too, so that what comes into reach is known beforehand
 ROUNDING_M = 1e-6
-T = TypeVar("T")
+Result = TypeVar("Result")
 
 
 class Helpers:
@@ -70,7 +70,7 @@ def tree_of(points: Float[np.ndarray, "m 3"]) -> cKDTree:
     return cKDTree(points, leafsize=LEAF_SIZE, balanced_tree=False, compact_nodes=False)
 
 
-def meanwhile(call: Callable[..., T], *args: Any) -> Callable[[], T]:
+def meanwhile(call: Callable[..., Result], *args: Any) -> Callable[[], Result]:
     """A call that goes on another core while this thread goes on; call what is returned to have its result."""
     if _num_cores() > 1:
         return _helpers.submit(call, *args).result
