@@ -84,10 +84,11 @@ def preprocess_timed(points: np.ndarray, times_s: np.ndarray | None, cfg: Prepro
     """
     points, rng = check_points(points), np.random.default_rng(0)  # the same scan gives the same bytes
     rows = np.arange(len(points)) if cfg.sampling == "raw" else _thinned(len(points), cfg.max_raw_points, rng)
-    columns = points.take(rows, axis=0)
+    columns = np.empty((len(rows), 3 if times_s is None else 4), np.float32)
+    columns[:, :3] = points.take(rows, axis=0)
     if times_s is not None:
         times = times_s.take(rows)
-        columns = np.column_stack([columns, np.where(np.isfinite(times), times, 0.0).astype(np.float32)])
+        columns[:, 3] = times if np.isfinite(times).all() else np.where(np.isfinite(times), times, 0.0)
     columns = _crop(columns, cfg)
     if cfg.sampling == "raw":
         return _raw_scan(columns, cfg, rng)
@@ -146,8 +147,11 @@ def _thinned(num: int, most: int, rng: np.random.Generator) -> np.ndarray:
     An even step would drop whole rings of a scan whose rows run from ring to ring.
     """
     stride = max(1, -(-num // most))
-    starts = np.arange(0, num, stride)
-    return starts if stride == 1 else np.minimum(starts + rng.integers(stride, size=len(starts), dtype=np.uint16), num - 1)
+    rows = np.arange(0, num, stride)
+    if stride > 1:
+        rows += rng.integers(stride, size=len(rows), dtype=np.uint16)
+        rows[-1] = min(rows[-1], num - 1)
+    return rows
 
 
 def _crop(columns: np.ndarray, cfg: PreprocessConfig) -> np.ndarray:
@@ -189,7 +193,17 @@ def voxel_mean(columns: np.ndarray, size: float) -> np.ndarray:
     if len(columns) == 0:
         return columns
     rows, starts = _by_voxel(columns[:, :3], size)
-    counts = np.diff(np.r_[starts, len(rows)]).astype(np.float32)
+    half = len(starts) // 2
+    if half == 0:
+        return _means(columns, rows, starts)
+    second = meanwhile(_means, columns, rows[starts[half] :], starts[half:] - starts[half])
+    first = _means(columns, rows[: starts[half]], starts[:half])
+    return np.concatenate([first, second()])
+
+
+def _means(columns: np.ndarray, rows: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Mean over each run of rows that begins at one of these places."""
+    counts = np.diff(starts, append=len(rows)).astype(np.float32)
     return np.add.reduceat(columns.take(rows, axis=0), starts, axis=0) / counts[:, None]
 
 

@@ -30,7 +30,7 @@ from rich.progress import Progress
 
 import delo_jax
 from delo_jax import weights
-from delo_jax.baselines.registry import METHODS
+from delo_jax.baselines.registry import METHODS, Method
 from delo_jax.errors import ConfigError, DeloError
 from delo_jax.metrics.ate import absolute_errors
 from delo_jax.metrics.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift, Segments, joined, mean_drift, segment_errors
@@ -41,6 +41,7 @@ from delo_jax.pipeline.lidar_odometry import LidarOdometry
 SEQUENCES = ("odo_00_056", "odo_04_000", "raw_0926_0013")
 OURS, NO_MAP = "delo", "delo, no map"
 PAIRS_ONLY = ("kiss-matcher",)  # takes most of a second a scan, and is no odometry
+NETWORKS = "of networks that you trained: of a method (dcp, delo-paper), or under another name, as a row of its own"
 LOST_M, LOST_DEG = 0.5, 2.0
 QUICK_ROUTE, QUICK = "04", 40  # scans
 
@@ -55,34 +56,33 @@ class Numbers(NamedTuple):
     not_ok: int
 
 
-def entries(names: list[str], params: Model, given: dict[str, str]) -> dict[str, Entry]:
-    """Methods by name, those that can run; of the others it says why not."""
+def entries(names: list[str], given: dict[str, str]) -> dict[str, Entry]:
+    """Methods by name, those that can run; of the others it says why not. A name that no method has is this package with weights given."""
     found = {}
-    for name in names:
-        method = METHODS[name]
-        model = params if name == OURS else (delo_jax.load(given[name]) if name in given else None)
+    weights_of = {OURS: "delo-base"} | given
+    for name in dict.fromkeys([*names, *(name for name in given if name not in METHODS)]):
+        method = METHODS.get(name, METHODS[OURS])
+        model = delo_jax.load(weights_of[name]) if name in weights_of else None
         try:
             method.check(model)
         except DeloError as error:
             print(f"left out: {error}", file=sys.stderr)
             continue
-        digest = "" if model is None else f"{weights.read_card(given.get(name, 'delo-base'))['sha256']} {model.cfg}"
+        digest = "" if model is None else f"{weights.read_card(weights_of[name])['sha256']} {model.cfg}"
         stamp = f"{source_hash(OWN if method.network else OTHERS)} {method.package_version} {digest}"
         opened = () if model is None else (model,)
+        tracker = None if name in PAIRS_ONLY else functools.partial(_tracker, method, opened)
+        found[name] = Entry(stamp, tracker, None if method.pair is None else functools.partial(method.open_pair, *opened))
         if name == OURS:
-            found[name] = Entry(stamp, functools.partial(LidarOdometry, params), functools.partial(method.open_pair, params))
-            found[NO_MAP] = Entry(stamp, functools.partial(LidarOdometry, params, use_map=False), None)
-        else:
-            tracker = None if name in PAIRS_ONLY else functools.partial(_tracked, name, opened)
-            found[name] = Entry(stamp, tracker, None if method.pair is None else functools.partial(method.open_pair, *opened))
+            found[NO_MAP] = Entry(stamp, functools.partial(LidarOdometry, *opened, use_map=False), None)
     return found
 
 
-def _tracked(name: str, opened: tuple) -> BaselineOdometry | LidarOdometry:
-    """A method along a drive; one without a tracker is `LidarOdometry` with its own weights, which have no fine stage for a map."""
-    if METHODS[name].tracker is None:
-        return LidarOdometry(*opened, use_map=False)
-    return BaselineOdometry(METHODS[name].open_tracker(*opened))
+def _tracker(method: Method, opened: tuple[Model, ...]) -> BaselineOdometry | LidarOdometry:
+    """A method along a drive; one without a tracker is `LidarOdometry`, on a map where the network has a fine stage for one."""
+    if method.tracker is None:
+        return LidarOdometry(*opened, use_map=opened[0].cfg.fine.num_iters > 0)
+    return BaselineOdometry(method.open_tracker(*opened))
 
 
 def numbers(results: Results, name: str, lengths_m: tuple[float, ...]) -> Numbers:
@@ -140,7 +140,7 @@ def judge(drifts: dict[str, Drift], lost: dict[tuple[str, int], float]) -> list[
     """Ours beside the best peer that ran: drift over all simulated drives; lost pairs."""
     rows = []
     for what, of in (("t_rel", "t_rel_percent"), ("r_rel", "r_rel_deg_per_100m")):
-        peers = [getattr(drift, of) for name, drift in drifts.items() if name not in (OURS, NO_MAP)]
+        peers = [getattr(drift, of) for name, drift in drifts.items() if name in METHODS and name != OURS]
         if OURS in drifts and peers:
             rows.append(Row(f"simulated drives: {what} / that of the best peer", getattr(drifts[OURS], of) / min(peers), "", 1.0))
     for gap in GAPS:
@@ -156,7 +156,7 @@ def parse(argv: list[str] | None, doc: str | None = __doc__):
     parser.add_argument("--routes", nargs="*", default=list(KINDS), help="official sequences to drive along")
     parser.add_argument("--sequences", nargs="*", default=list(SEQUENCES), help="recorded ones of the tree")
     parser.add_argument("--methods", nargs="*", default=list(METHODS), help="of `delo run --help`; all by default")
-    parser.add_argument("--weights", nargs="*", default=[], metavar="METHOD=FILE", help="of networks that you trained: dcp, delo-paper")
+    parser.add_argument("--weights", nargs="*", default=[], metavar="NAME=FILE", help=NETWORKS)
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"), help="store")
     parser.add_argument("--jobs", type=int, default=len(cores()), help="sequences at a time, each with its share of the cores")
     args = parser.parse_args(argv)
@@ -180,7 +180,7 @@ def opened(data: Path, name: str, num_scans: int | None, bar: Progress) -> Seque
 
 def work(args, name: str, num_scans: int | None, methods: list[str]) -> None:
     """What the methods make of a sequence, into the store; in a process of its own."""
-    found = entries(methods, delo_jax.load("delo-base"), _weights(args))
+    found = entries(methods, _weights(args))
     run(opened(args.data, name, num_scans, Progress(disable=True)), found, args.out, Counting())
 
 
@@ -191,7 +191,7 @@ def _weights(args) -> dict[str, str]:
 def main(argv: list[str] | None = None) -> int:
     """Run what is missing, print, judge."""
     args = parse(argv)
-    methods = entries(args.methods, delo_jax.load("delo-base"), _weights(args))
+    methods = entries(args.methods, _weights(args))
     results: list[list[Results]] = []
     with _harness.progress() as bar:
         both = [[(opened(args.data, *which, bar), which) for which in group] for group in chosen(args)]

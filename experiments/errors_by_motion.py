@@ -17,7 +17,6 @@ from _harness import Row
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-import delo_jax
 from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.metrics.ate import relative_errors
 from delo_jax.metrics.drift import KITTI_LENGTHS_M, KITTI_MIN_SEGMENTS, drift_by_speed, joined, mean_drift, segment_errors
@@ -108,7 +107,7 @@ def draw(path: Path, columns: dict[str, tuple[dict[str, Curve], tuple[str, str, 
 def main(argv: list[str] | None = None) -> int:
     """Read, bin, print, draw."""
     args = benchmark.parse(argv, __doc__)
-    methods = benchmark.entries([name for name in args.methods if name in SHOWN], delo_jax.load("delo-base"), {})
+    methods = benchmark.entries([name for name in args.methods if name in SHOWN], {})
     with _harness.progress() as bar:
         drives = [benchmark.opened(args.data, *which, bar) for which in benchmark.chosen(args)[0]]
         results = [run(sequence, methods, args.out, bar) for sequence in drives]

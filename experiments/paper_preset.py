@@ -1,13 +1,14 @@
-"""The `paper` preset, or `dcp`, trained on simulation at the largest size that fits the machine, against doing nothing, and against ours.
+"""The preset `paper`, `official` or `dcp`, trained on simulation at the largest size that fits the machine, beside doing nothing and ours.
 
 The network of the paper with all its parts (edge convolutions, transformer, exact partial transport with m = 0.1 and xi = 5,
 Procrustes on the plan, joint evidence), narrowed so that two cores train it in an hour, then tested at frame gaps 1 and
 3 on worlds that no training has seen: beside the identity, the mean motion of the training worlds, `delo-base`, and what
 limits any plan between so few points: Procrustes on averages of the target points around each point's true place. The
-learning curve is printed and drawn. With an accelerator, `--width 512` is the paper's size. `--preset dcp` is Deep Closest Point
-by the same steps: a softmax in place of the transport, absolute edges, no evidence; for `benchmark.py`.
+learning curve is printed and drawn. With an accelerator, `--width 512` is the paper's size. By the same steps, for
+`benchmark.py`: `--preset official`, DELO as its code was released, and `--preset dcp`, Deep Closest Point: a softmax in place of the
+transport, absolute edges, no evidence.
 
-Run:     python experiments/paper_preset.py [--preset dcp] [--out DIR]     (about 70 minutes on 2 cores; resumes)
+Run:     python experiments/paper_preset.py [--preset official|dcp] [--out DIR]     (about 70 minutes on 2 cores; resumes)
 Expect:  paper's medians at gaps 1 and 3 at least 30 % below the better of identity and mean motion, translation and rotation each.
 """
 
@@ -58,6 +59,7 @@ class Settings:
     num_test_worlds: int = 100
 
 
+NAMES = {"paper": "delo-paper", "official": "delo-official", "dcp": "dcp"}  # of the weights
 TRAINED = "this network"
 QUICK = Settings(width=32, num_points=64, num_steps=20, num_last_steps=10, batch_size=2, num_scenes=4, num_test_worlds=2)
 
@@ -106,8 +108,8 @@ def stages(settings: Settings) -> list[TrainConfig]:
 
 
 def own_losses(cfg: TrainConfig, weight: float) -> TrainConfig:
-    """With a weight of the paper's own losses, of pose and evidence; DCP has no evidence."""
-    return replace(cfg, odometry_weight=weight, evidence_weight=weight if cfg.model.evidence.head != "none" else 0.0)
+    """With a weight on the preset's own losses, of pose and evidence."""
+    return replace(cfg, odometry_weight=weight * cfg.odometry_weight, evidence_weight=weight * cfg.evidence_weight)
 
 
 def in_range(world: World, max_range_m: float) -> World:
@@ -227,7 +229,7 @@ def learning_curve(validations: dict[int, list[dict]], num_first: int, file: Pat
 def main(argv: list[str] | None = None) -> int:
     """Train, test, judge."""
     parser = _harness.parser(__doc__, needs_data=False)
-    parser.add_argument("--preset", choices=("paper", "dcp"), default="paper", help="dcp: softmax in place of the transport, no evidence")
+    parser.add_argument("--preset", choices=tuple(NAMES), default="paper", help="official: the released code; dcp: softmax in its place")
     parser.add_argument("--out", type=Path, help="worlds, checkpoints and weights, by default runs/NAME-preset; an interrupted run goes on")
     parser.add_argument("--width", type=int, default=Settings.width, help="D, a multiple of 32")
     parser.add_argument("--points", type=int, default=Settings.num_points, help="N")
@@ -236,7 +238,7 @@ def main(argv: list[str] | None = None) -> int:
     settings = replace(settings, preset=args.preset)
     folder = args.out or Path(f"runs/{args.preset}-preset")
     out = folder / "quick" if args.quick else folder
-    name = "delo-paper" if args.preset == "paper" else args.preset
+    name = NAMES[args.preset]
     with _harness.progress() as bar:
         model, training, curve, num_nonfinite = train(settings, folder / "worlds", out, bar)
         weights.save(out / name, model, {"name": name, "training": dataclasses.asdict(settings)})

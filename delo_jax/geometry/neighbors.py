@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 LEAF_SIZE = 24
 MAX_PARTS = 4
 MIN_PART = 768  # points: fewer are not worth another thread
-MARGIN_M = 0.2  # beyond the reach that is searched, too, so that what comes into reach is known beforehand
 ROUNDING_M = 1e-6
 Result = TypeVar("Result")
 
@@ -104,36 +103,28 @@ def nearest_in(
 
 
 class Nearest:
-    """The nearest of a tree's points within reach, searched for anew only where it may have become another one.
+    """The nearest of a tree's points, searched for anew only where it may have become another one.
 
     Where the nearest is d1 away and the next d2, the nearest stays while the point moves by less than (d2 - d1) / 2 (triangle inequality).
 
     Args:
         tree: of the points to find.
-        reach_m: farther away, nothing is found.
+        num: of the points that may be asked for, now and then, some or all of them.
     """
 
-    def __init__(self, tree: cKDTree, reach_m: float):
-        self._tree, self._reach_m = tree, reach_m
-        self._points = np.zeros((0, 3), np.float32)  # where each was when it was searched for
-        self._index, self._slack_m = np.zeros(0, np.int64), np.zeros(0)
+    def __init__(self, tree: cKDTree, num: int):
+        self._tree, self.num = tree, num
+        self._points = np.zeros((num, 3), np.float32)  # where each was when it was searched for
+        self._index, self._slack_m = np.zeros(num, np.int64), np.full(num, -np.inf)
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Index of the nearest of each of (n, 3) points; the number of the tree's points where none is within reach."""
-        if len(points) == len(self._points):
-            moved_m = np.linalg.norm(points - self._points, axis=1)
-            anew = np.flatnonzero(moved_m >= self._slack_m - ROUNDING_M)
-        else:
-            self._points, self._index, self._slack_m = np.empty_like(points), np.empty(len(points), np.int64), np.empty(len(points))
-            anew = np.arange(len(points))
-        bound_m = self._reach_m + MARGIN_M
-        distances, index = nearest_in(self._tree, points[anew], 2, bound_m)
-        first_m, second_m = np.minimum(distances, bound_m).T
-        self._points[anew], self._index[anew] = points[anew], index[:, 0]
-        self._slack_m[anew] = np.where(index[:, 0] < self._tree.n, 0.5 * (second_m - first_m), MARGIN_M)
-        offsets = points - self._tree.data.take(self._index, axis=0, mode="clip")
-        near = np.einsum("ij,ij->i", offsets, offsets) < self._reach_m**2
-        return np.where(near, self._index, self._tree.n)
+    def __call__(self, points: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+        """Index of the nearest to each of (n, 3) points, which are those rows of all."""
+        searched, index, slack_m = self._points[rows], self._index[rows], self._slack_m[rows]
+        anew = np.flatnonzero(np.linalg.norm(points - searched, axis=1) >= slack_m - ROUNDING_M)
+        if len(anew):
+            distances, found = nearest_in(self._tree, points[anew], 2, np.inf)
+            searched[anew], index[anew], slack_m[anew] = points[anew], found[:, 0], 0.5 * (distances[:, 1] - distances[:, 0])
+        return index
 
 
 def _num_cores() -> int:

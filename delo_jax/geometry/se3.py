@@ -2,7 +2,8 @@
 
 Conventions, here and everywhere in the package: twists and covariances are ordered `[omega (rad), v (m)]` and
 perturb a pose from the right, `T exp(xi^)`, that is, in the body frame. One implementation serves NumPy (float64 on
-the host) and JAX (inside jit); leading dimensions batch where the annotation shows `*b`.
+the host) and JAX (inside jit); leading dimensions batch where the annotation shows `*b`. One pose alone on the host
+goes a shorter way through `exp` and `log`: there every call of a NumPy function counts.
 """
 
 import math
@@ -18,6 +19,9 @@ AnyArray = jax.Array | np.ndarray
 
 # Below this squared angle the closed forms cancel; five terms of the series are exact there in float64.
 _SMALL = 1e-3
+_SERIES = [[(-1) ** k / math.factorial(2 * k + n) for k in range(5)] for n in (1, 2, 3)]  # of `_rotation_coefficients`
+_ARCTAN_SERIES = [(-1) ** k / (2 * k + 1) for k in range(5)]  # arctan(x) / x by x^2
+_LOG_SERIES = [1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160]  # (1 - theta / 2 cot(theta / 2)) / theta^2 by theta^2
 
 
 def _namespace(x):
@@ -45,16 +49,17 @@ def _rotation_coefficients(theta2):
     """sin(theta)/theta, (1 - cos(theta))/theta^2 and (theta - sin(theta))/theta^3, finite and smooth at 0."""
     xp = _namespace(theta2)
     small = theta2 < _SMALL
+    if xp is np and small.all():  # one product: on the host, a pass over a few numbers costs as much as one over a thousand
+        powers = np.vander(theta2.ravel(), 5, increasing=True)
+        return tuple((np.array(_SERIES) @ powers.T).astype(theta2.dtype).reshape(3, *theta2.shape))
+    series = (_polynomial(theta2, coefficients) for coefficients in _SERIES)
     theta = xp.sqrt(xp.where(small, 1.0, theta2))
     closed = (
         xp.sin(theta) / theta,
         0.5 * (xp.sin(0.5 * theta) / (0.5 * theta)) ** 2,
         (theta - xp.sin(theta)) / theta**3,
     )
-    return tuple(
-        xp.where(small, _polynomial(theta2, [(-1) ** k / math.factorial(2 * k + n) for k in range(5)]), value)
-        for n, value in enumerate(closed, start=1)
-    )
+    return tuple(xp.where(small, *values) for values in zip(series, closed, strict=True))
 
 
 def skew(v: Float[AnyArray, "*b 3"]) -> Float[AnyArray, "*b 3 3"]:
@@ -70,6 +75,8 @@ def skew(v: Float[AnyArray, "*b 3"]) -> Float[AnyArray, "*b 3 3"]:
 def exp(xi: Float[AnyArray, "*b 6"]) -> Float[AnyArray, "*b 4 4"]:
     """Pose reached by following the twist `xi = [omega, v]` for unit time; smooth at zero."""
     xp = _namespace(xi)
+    if xp is np and xi.ndim == 1:
+        return _exp_of_one(xi)
     omega, v = xi[..., :3], xi[..., 3:]
     a, b, c = _rotation_coefficients(xp.sum(omega * omega, axis=-1)[..., None, None])
     W = skew(omega)
@@ -79,12 +86,29 @@ def exp(xi: Float[AnyArray, "*b 6"]) -> Float[AnyArray, "*b 4 4"]:
     return _assemble(eye + a * W + b * WW, (V @ v[..., None])[..., 0])
 
 
+def _exp_of_one(xi: np.ndarray) -> np.ndarray:
+    """The same of one twist on the host; what are numbers here would be arrays of one element, at ten times the cost."""
+    x, y, z = xi[:3].tolist()
+    theta2 = x * x + y * y + z * z
+    theta = math.sqrt(theta2)
+    if theta2 < _SMALL:
+        a, b, c = (_polynomial(theta2, coefficients) for coefficients in _SERIES)
+    else:
+        a, b, c = math.sin(theta) / theta, 2.0 * (math.sin(0.5 * theta) / theta) ** 2, (theta - math.sin(theta)) / theta**3
+    T, W, v = np.eye(4, dtype=xi.dtype), np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], xi.dtype), xi[3:]
+    Wv = W @ v
+    T[:3, :3] += a * W + b * (W @ W)
+    T[:3, 3] = v + b * Wv + c * (W @ Wv)
+    return T
+
+
 def exp_along(xi: Float[np.ndarray, "6"], times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
     """Poses reached by following one twist for each of these times, `exp(times[k] * xi)`; on the host."""
-    W, v = skew(xi[:3]), xi[3:]
-    a, b, c = _rotation_coefficients(np.square(times) * np.dot(xi[:3], xi[:3]))
-    weights = np.stack([np.ones_like(times), times, a * times, b * times**2, c * times**3], axis=1)
-    parts = np.zeros((5, 4, 4))
+    (x, y, z), v = xi[:3].tolist(), xi[3:]
+    W, squares = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], xi.dtype), times * times
+    a, b, c = _rotation_coefficients(squares * (x * x + y * y + z * z))
+    weights = np.array([np.ones_like(times), times, a * times, b * squares, c * squares * times]).T
+    parts = np.zeros((5, 4, 4), xi.dtype)
     parts[0], parts[1, :3, 3] = np.eye(4), v
     parts[2, :3, :3], parts[3, :3, :3] = W, W @ W
     parts[3, :3, 3], parts[4, :3, 3] = W @ v, W @ (W @ v)
@@ -116,7 +140,7 @@ def _rotation_log(R):
     small = norm2 < _SMALL * w * w
     safe_w = xp.where(small, w, 1.0)
     norm = xp.sqrt(xp.where(small, 1.0, norm2))
-    series = _polynomial(norm2 / safe_w**2, [(-1) ** k / (2 * k + 1) for k in range(5)]) / safe_w
+    series = _polynomial(norm2 / safe_w**2, _ARCTAN_SERIES) / safe_w
     return 2.0 * vector * xp.where(small, series, xp.arctan2(norm, w) / norm)
 
 
@@ -124,16 +148,47 @@ def _rotation_log(R):
 def log(T: Float[AnyArray, "*b 4 4"]) -> Float[AnyArray, "*b 6"]:
     """Twist `[omega, v]` with `exp(xi) = T`, |omega| <= pi; smooth at the identity, stable near pi."""
     xp = _namespace(T)
+    if xp is np and T.ndim == 2:
+        return _log_of_one(T)
     omega = _rotation_log(T[..., :3, :3])
     theta2 = xp.sum(omega * omega, axis=-1)[..., None, None]
     a, b, _ = _rotation_coefficients(theta2)
     small = theta2 < _SMALL
-    series = _polynomial(theta2, [1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160])
+    series = _polynomial(theta2, _LOG_SERIES)
     d = xp.where(small, series, (1.0 - 0.5 * a / b) / xp.where(small, 1.0, theta2))
     W = skew(omega)
     t = T[..., :3, 3:]
     Wt = W @ t
     return xp.concatenate([omega, (t - 0.5 * Wt + d * (W @ Wt))[..., 0]], axis=-1)
+
+
+def _log_of_one(T: np.ndarray) -> np.ndarray:
+    """The same of one pose on the host."""
+    (xx, xy, xz, tx), (yx, yy, yz, ty), (zx, zy, zz, tz) = T[:3].tolist()
+    rows = (
+        (1.0 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
+        (zy - yz, 1.0 + xx - yy - zz, xy + yx, xz + zx),
+        (xz - zx, xy + yx, 1.0 - xx + yy - zz, yz + zy),
+        (yx - xy, xz + zx, yz + zy, 1.0 - xx - yy + zz),
+    )
+    w, x, y, z = rows[max(range(4), key=lambda k: rows[k][k])]
+    norm2 = x * x + y * y + z * z
+    if norm2 < _SMALL * w * w:
+        scale = 2.0 * _polynomial(norm2 / (w * w), _ARCTAN_SERIES) / w
+    else:
+        norm = math.sqrt(norm2)
+        scale = 2.0 * math.atan2(norm, abs(w)) / math.copysign(norm, w)  # of q and -q the one with an angle in [0, pi]
+    x, y, z = scale * x, scale * y, scale * z
+    theta2 = x * x + y * y + z * z
+    half = 0.5 * math.sqrt(theta2)
+    d = _polynomial(theta2, _LOG_SERIES) if theta2 < _SMALL else (1.0 - half / math.tan(half)) / theta2
+    ux, uy, uz = y * tz - z * ty, z * tx - x * tz, x * ty - y * tx
+    v = [
+        tx - 0.5 * ux + d * (y * uz - z * uy),
+        ty - 0.5 * uy + d * (z * ux - x * uz),
+        tz - 0.5 * uz + d * (x * uy - y * ux),
+    ]
+    return np.array([x, y, z, *v], T.dtype)
 
 
 @full_float32

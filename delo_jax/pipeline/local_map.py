@@ -1,6 +1,5 @@
 """The local map: surfaces seen lately, one per voxel, around the sensor. Host code."""
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -132,32 +131,30 @@ class Surroundings:
     """
 
     def __init__(self, local_map: LocalMap, T_world_start: np.ndarray, reach_m: float):
-        self._seen = local_map.crop(T_world_start, CROP_M)
+        self._seen, self._reach_m = local_map.crop(T_world_start, CROP_M), reach_m
         self.usable = len(self._seen.points) >= MIN_TARGETS
-        self._tree, self._reach_m = meanwhile(tree_of, np.asarray(self._seen.points)), reach_m
+        self._tree = meanwhile(tree_of, np.asarray(self._seen.points))
+        self._nearest: Nearest | None = None
 
-    @functools.cached_property
-    def _nearest(self) -> Nearest:
-        return Nearest(self._tree(), np.inf)
-
-    @functools.cached_property
-    def _in_reach(self) -> Nearest:
-        return Nearest(self._tree(), self._reach_m)
-
-    def matches(self, source: Surfaces, T: np.ndarray) -> Surfaces:
-        """The nearest surface to each of n points at T_start_lidar, searched for anew where they have moved. The map must be usable."""
-        index = self._nearest(_moved(source, T))
-        return Surfaces(*(array.take(index, axis=0, mode="clip") for array in self._seen))
+    def matches(self, source: Surfaces, T: np.ndarray, rows: slice = slice(None)) -> Surfaces:
+        """The nearest surface to each of those rows of a scan at T_start_lidar. The map must be usable."""
+        _, index = self._matched(source, T, rows)
+        return Surfaces(*(array.take(index, axis=0) for array in self._seen))
 
     def planes_in_reach(self, source: Surfaces, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Point and normal, each (n, 3), of the same; of some other surface where none is within reach."""
-        index = self._in_reach(_moved(source, T))
-        points, normals = (np.asarray(array).take(index, axis=0, mode="clip") for array in self._seen[:2])
-        return points, normals
+        """Point and normal of the same, each (n, 3), for all of a scan; of some other surface where none is within reach."""
+        moved, index = self._matched(source, T, slice(None))
+        points, normals = (np.asarray(array) for array in self._seen[:2])
+        offsets = moved - points.take(index, axis=0)
+        index = np.where(np.einsum("ij,ij->i", offsets, offsets) < self._reach_m**2, index, len(points) - 1)
+        return points.take(index, axis=0), normals.take(index, axis=0)
 
-
-def _moved(source: Surfaces, T: np.ndarray) -> np.ndarray:
-    return np.asarray(source.points) @ T[:3, :3].T + T[:3, 3]
+    def _matched(self, source: Surfaces, T: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Those rows in the map's frame, and the number of the surface nearest to each."""
+        if self._nearest is None or self._nearest.num != len(source.points):
+            self._nearest = Nearest(self._tree(), len(source.points))
+        moved = np.asarray(source.points)[rows] @ T[:3, :3].T + T[:3, 3]
+        return moved, self._nearest(moved, rows)
 
 
 def _near(voxels: _Voxels, T_world_lidar: np.ndarray, reach_m: float) -> np.ndarray:

@@ -104,12 +104,12 @@ def register(
     if not near.usable:
         return NOWHERE
     first = min(skip, max(scan.num_points - NUM_LEARNED_POINTS, 0))
-    source = surfaces_of(scan.scan, slice(first, first + NUM_LEARNED_POINTS))
+    source, rows, fix = surfaces_of(scan.scan), slice(first, first + NUM_LEARNED_POINTS), NOWHERE
+    some = surfaces_of(scan.scan, rows)
     for _ in range(num_learned):
-        T = np.asarray(inference.fine_step(params, source, near.matches(source, T), T))
+        T = np.asarray(inference.fine_step(params, some, near.matches(source, T, rows), T))
         if not np.isfinite(T).all():
             return NOWHERE
-    source, fix = surfaces_of(scan.scan), NOWHERE
     for num_steps in [ROBUST_STEPS] * num_rounds or [0]:
         fit = _robust(source, near.planes_in_reach(source, T), T, num_steps)
         fix, T = _fix_of(fit), np.asarray(fit.T_target_source)

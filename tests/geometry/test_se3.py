@@ -39,6 +39,8 @@ def test_exp_is_the_matrix_exponential(angle):
     assert T.dtype == np.float64
     np.testing.assert_allclose(T, [expm(hat(x)) for x in xi], atol=5e-13)
     np.testing.assert_allclose(T, [gtsam.Pose3.Expmap(x).matrix() for x in xi], atol=1e-11)
+    np.testing.assert_allclose([se3.exp(x) for x in xi], [expm(hat(x)) for x in xi], atol=5e-13)
+    assert se3.exp(xi[0].astype(np.float32)).dtype == se3.exp(xi.astype(np.float32)).dtype == np.float32
 
 
 @pytest.mark.parametrize("angle", ANGLES)
@@ -53,7 +55,10 @@ def test_exp_along_a_twist_is_the_matrix_exponential(angle):
 def test_log_inverts_the_matrix_exponential_up_to_pi(angle):
     """Oracle: the twist that scipy's expm was given; no angle below pi is special, that of a half turn included."""
     xi = twists(angle)
-    np.testing.assert_allclose(se3.log(np.stack([expm(hat(x)) for x in xi])), xi, atol=1e-11)
+    Ts = np.stack([expm(hat(x)) for x in xi])
+    np.testing.assert_allclose(se3.log(Ts), xi, atol=1e-11)
+    np.testing.assert_allclose([se3.log(T) for T in Ts], xi, atol=1e-11)
+    assert se3.log(Ts[0].astype(np.float32)).dtype == np.float32
 
 
 def test_log_of_half_turns():
@@ -61,9 +66,16 @@ def test_log_of_half_turns():
     for axis in [*np.eye(3), np.array([0.6, 0.0, -0.8]), np.ones(3) / np.sqrt(3)]:
         T = np.eye(4)
         T[:3, :3] = 2 * np.outer(axis, axis) - np.eye(3)
-        omega = se3.log(T)[:3]
-        np.testing.assert_allclose(Rotation.from_rotvec(omega).as_matrix(), T[:3, :3], atol=1e-14)
-        assert np.linalg.norm(omega) == pytest.approx(np.pi)
+        for omega in (se3.log(T)[:3], se3.log(T[None])[0, :3]):
+            np.testing.assert_allclose(Rotation.from_rotvec(omega).as_matrix(), T[:3, :3], atol=1e-14)
+            assert np.linalg.norm(omega) == pytest.approx(np.pi)
+
+
+def test_log_of_no_number_is_none():
+    """Oracle: a pose of which nothing is known, alone and with others."""
+    T = np.full((4, 4), np.nan)
+    assert np.isnan(se3.log(T)).all()
+    assert np.isnan(se3.log(T[None])).all()
 
 
 @given(arrays(np.float64, 6, elements=st.floats(-1.5, 1.5)))
