@@ -75,7 +75,7 @@ def skew(v: Float[AnyArray, "*b 3"]) -> Float[AnyArray, "*b 3 3"]:
 def exp(xi: Float[AnyArray, "*b 6"]) -> Float[AnyArray, "*b 4 4"]:
     """Pose reached by following the twist `xi = [omega, v]` for unit time; smooth at zero."""
     xp = _namespace(xi)
-    if xp is np and xi.ndim == 1:
+    if isinstance(xi, np.ndarray) and xi.ndim == 1:
         return _exp_of_one(xi)
     omega, v = xi[..., :3], xi[..., 3:]
     a, b, c = _rotation_coefficients(xp.sum(omega * omega, axis=-1)[..., None, None])
@@ -148,7 +148,7 @@ def _rotation_log(R):
 def log(T: Float[AnyArray, "*b 4 4"]) -> Float[AnyArray, "*b 6"]:
     """Twist `[omega, v]` with `exp(xi) = T`, |omega| <= pi; smooth at the identity, stable near pi."""
     xp = _namespace(T)
-    if xp is np and T.ndim == 2:
+    if isinstance(T, np.ndarray) and T.ndim == 2:
         return _log_of_one(T)
     omega = _rotation_log(T[..., :3, :3])
     theta2 = xp.sum(omega * omega, axis=-1)[..., None, None]
