@@ -193,16 +193,6 @@ def voxel_mean(columns: np.ndarray, size: float) -> np.ndarray:
     if len(columns) == 0:
         return columns
     rows, starts = _by_voxel(columns[:, :3], size)
-    half = len(starts) // 2
-    if half == 0:
-        return _means(columns, rows, starts)
-    second = meanwhile(_means, columns, rows[starts[half] :], starts[half:] - starts[half])
-    first = _means(columns, rows[: starts[half]], starts[:half])
-    return np.concatenate([first, second()])
-
-
-def _means(columns: np.ndarray, rows: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Mean over each run of rows that begins at one of these places."""
     counts = np.diff(starts, append=len(rows)).astype(np.float32)
     return np.add.reduceat(columns.take(rows, axis=0), starts, axis=0) / counts[:, None]
 
