@@ -55,6 +55,10 @@ class Source(NamedTuple):
     stamp_ns: int
     number: int  # of its frame
 
+    def seconds_until(self, stamp_ns: int) -> float:
+        """From its stamp to another one."""
+        return (stamp_ns - self.stamp_ns) * NANOSECOND
+
 
 class Anchor(NamedTuple):
     """A source and where it was."""
@@ -163,7 +167,7 @@ class LidarOdometry:
         """What can be made of the map before the scan is prepared."""
         if self._map is None or self._anchor is None:
             return
-        elapsed_s = (stamp_ns - self._anchor.source.stamp_ns) * NANOSECOND
+        elapsed_s = self._anchor.source.seconds_until(stamp_ns)
         if self._motion_model.can_tell(elapsed_s):
             self._map.expect(self._anchor.T_world_lidar @ self._motion_model.predict(elapsed_s))
 
@@ -186,7 +190,7 @@ class LidarOdometry:
         """Motion to a new scan by the map, from the motion model's prediction; where that is bad, from other hypotheses."""
         if self._anchor is None:
             return Answer(self._first(target), target)
-        expected, elapsed_s = None, self._elapsed_s(self._anchor.source, target)
+        expected, elapsed_s = None, self._anchor.source.seconds_until(target.stamp_ns)
         if self._motion_model.can_tell(elapsed_s):
             guess = self._motion_model.predict(elapsed_s)
             expected = tracker.locate(target.scan, self._anchor.T_world_lidar, [guess], elapsed_s, recovering=False)
@@ -216,7 +220,7 @@ class LidarOdometry:
         since = self._anchor  # its scan may have been de-skewed by its first motion
         if self._motion_model.velocity is None:
             self._restart(tracker, since)
-        elapsed_s = self._elapsed_s(since.source, target)
+        elapsed_s = since.source.seconds_until(target.stamp_ns)
         guesses = self._motion_model.predictions(elapsed_s)
         if pair.status != "rejected":
             guesses.append(pair.T_target_source)
@@ -248,7 +252,7 @@ class LidarOdometry:
 
     def _align_to(self, source: Source, target: Source) -> tuple[Estimate, Source]:
         """Motion T_source_target of a pair, started from the motion model's prediction, and the target as it was aligned."""
-        elapsed_s = self._elapsed_s(source, target)
+        elapsed_s = source.seconds_until(target.stamp_ns)
         guess = se3.inverse(self._motion_model.predict(elapsed_s))
         estimate = self._align(self._params, source.scan, target.scan, guess)
         if self._motion_model.velocity is None and estimate.status != "rejected":
@@ -263,15 +267,11 @@ class LidarOdometry:
                         self._anchor = self._anchor._replace(source=source._replace(scan=scans[0]))
         return estimate.inverted(), target
 
-    @staticmethod
-    def _elapsed_s(source: Source, target: Source) -> float:
-        return (target.stamp_ns - source.stamp_ns) * NANOSECOND
-
     def _unmeasured(self, stamp_ns: int, reason: str) -> Estimate:
         """What the motion model says of a motion that was not measured."""
-        since_ns = stamp_ns if self._anchor is None else self._anchor.source.stamp_ns
+        elapsed_s = 0.0 if self._anchor is None else self._anchor.source.seconds_until(stamp_ns)
         known = covariance.unknown(self._params.cfg.status)
-        motion = Estimate.exact(self._motion_model.predict((stamp_ns - since_ns) * NANOSECOND))
+        motion = Estimate.exact(self._motion_model.predict(elapsed_s))
         return dataclasses.replace(motion, **known._asdict(), status="rejected", confidence=0.0, reason=reason)
 
     def _finish(self, answer: Answer, stamp_ns: int, timing: dict[str, float]) -> Frame:
@@ -291,7 +291,7 @@ class LidarOdometry:
             motion = dataclasses.replace(motion, **known._asdict())
         if target is not None and not rejected:
             if anchor is not None:
-                self._motion_model.update(motion.T_target_source, (stamp_ns - anchor.source.stamp_ns) * NANOSECOND)
+                self._motion_model.update(motion.T_target_source, anchor.source.seconds_until(stamp_ns))
             if self._map is not None and not self._map_refused:
                 begin = time.perf_counter()
                 if self._map.insert(target.scan, T_world_lidar) and answer.noise is None:
