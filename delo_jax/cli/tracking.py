@@ -194,7 +194,10 @@ def _loop(
             if refiner is not None and isinstance(odometry, LidarOdometry):
                 refiner.add(_tracked(frame, odometry.last_scan))
             if frame.status != "rejected" and not isinstance(scan, str):
-                cloud.add_scan(index, frame.T_world_lidar, getattr(odometry, "last_scan", None) or scan)  # not every method keeps it
+                if isinstance(odometry, LidarOdometry):
+                    cloud.add_scan(index, frame.T_world_lidar, odometry.last_scan or scan)
+                else:
+                    cloud.add_scan(index, frame.T_world_lidar, scan, odometry.velocity)
             bar.advance(task)
     return acquired, False
 

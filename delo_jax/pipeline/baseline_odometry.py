@@ -78,6 +78,11 @@ class BaselineOdometry:
         """All frames so far."""
         return self._trajectory
 
+    @property
+    def velocity(self) -> np.ndarray | None:
+        """Of the last motion, (6,) [omega rad/s, v m/s], to de-skew its scan with; None where that is not known or not wanted."""
+        return self._motion_model.velocity if self._deskew else None
+
     def _check_stamp(self, stamp_ns: int | None) -> int:
         return checked_stamp(stamp_ns, self._last_stamp_ns if self._num_frames else None)
 

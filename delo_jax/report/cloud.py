@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 
 from delo_jax.data.fields import RawScan
 from delo_jax.geometry import se3
+from delo_jax.geometry.deskew import deskew
 from delo_jax.inference import PreparedScan
 
 SLOT_BITS = 21
@@ -76,13 +77,24 @@ class DriveCloud:
         while self._count > 2 * self._max_points:
             self._coarsen(COARSER)
 
-    def add_scan(self, number: int, T_world_lidar: np.ndarray, scan: PreparedScan | RawScan) -> None:
-        """Takes what is new in a scan as it was registered, or in an even share of a raw one; once a metre or so."""
+    def add_scan(self, number: int, T_world_lidar: np.ndarray, scan: PreparedScan | RawScan, velocity: np.ndarray | None = None) -> None:
+        """Takes what is new in a scan as it was registered, or in an even share of a raw one; once a metre or so.
+
+        Args:
+            number: of its frame, below 2^24.
+            T_world_lidar: where the scan was taken, as far as is known now.
+            scan: prepared or raw.
+            velocity: (6,) of the body, [omega rad/s, v m/s], that a raw scan is de-skewed with where it has times.
+        """
         if self._taken_at is not None and se3.is_within(self._taken_at, T_world_lidar, SPACING_M, SPACING_DEG):
             return
         self._taken_at = T_world_lidar
         if isinstance(scan, RawScan):
-            self.add(number, scan.points[:: 1 + len(scan.points) // MAX_RAW_POINTS], T_world_lidar)
+            share = slice(None, None, 1 + len(scan.points) // MAX_RAW_POINTS)
+            points = scan.points[share]
+            if velocity is not None and scan.times is not None:
+                points = deskew(points, scan.times[share], velocity)
+            self.add(number, points, T_world_lidar)
         else:
             self.add(number, np.asarray(scan.scan.points)[np.asarray(scan.scan.mask)], T_world_lidar)
 

@@ -1,3 +1,4 @@
+import gtsam
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -87,3 +88,19 @@ def test_a_scan_a_metre():
         cloud.add_scan(number, T, RawScan(points=walls(rng, 50), times=None))
         counts.append(len(cloud) - before)
     assert [count > 0 for count in counts] == [True, False, False, True, False, False, True, True]
+
+
+def test_raw_scans_are_de_skewed_where_their_velocity_is_known():
+    """Oracle: points that stand still in the world, seen from poses on the way by gtsam's exponential map."""
+    rng, velocity = np.random.default_rng(0), np.array([0.0, 0.1, 0.6, 15.0, 0.3, 0.0])
+    world, times = walls(rng, 3000), rng.uniform(-0.05, 0.05, 3000)
+    measured = [gtsam.Pose3.Expmap(velocity * t).inverse().matrix() @ np.r_[point, 1.0] for point, t in zip(world, times, strict=True)]
+    scan = RawScan(points=np.array(measured, np.float32)[:, :3], times=times)
+    errors = []
+    for known in (None, velocity):
+        cloud = DriveCloud(voxel_m=0.01, range_m=(0.0, 100.0))
+        cloud.add_scan(0, np.eye(4), scan, known)
+        distances, _ = cKDTree(world).query(cloud.placed(np.eye(4)[None]).points)
+        errors.append(np.quantile(distances, 0.9))
+    assert errors[0] > 0.15
+    assert errors[1] < 0.01
