@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from delo_jax.data.fields import FRAME_PERIOD_NS
 from delo_jax.metrics.ate import relative_errors
-from delo_jax.metrics.drift import KITTI_LENGTHS_M, KITTI_MIN_SEGMENTS, drift_by_speed, joined, mean_drift, segment_errors
+from delo_jax.metrics.drift import KITTI_LENGTHS_M, KITTI_MIN_SEGMENTS, SHORT_LENGTHS_M, drift_by_speed, joined, mean_drift, segment_errors
 from delo_jax.report.calibration import COLORS
 
 SHOWN = ("delo", "delo, no map", "kiss-icp", "genz-icp", "vgicp", "gicp")  # the others are off the scale
@@ -66,7 +66,9 @@ def by_length(results: list[Results], name: str) -> Curve:
 
 
 def _segments(results: list[Results], name: str):
-    return joined([segment_errors(one.poses[name].Ts_world_lidar, one.Ts_world_lidar, lengths_m=KITTI_LENGTHS_M) for one in results])
+    shortest_m = min(np.linalg.norm(np.diff(one.Ts_world_lidar[:, :3, 3], axis=0), axis=1).sum() for one in results)
+    lengths_m = KITTI_LENGTHS_M if shortest_m > KITTI_LENGTHS_M[0] else SHORT_LENGTHS_M  # of a quick run
+    return joined([segment_errors(one.poses[name].Ts_world_lidar, one.Ts_world_lidar, lengths_m=lengths_m) for one in results])
 
 
 def show(title: str, unit: str, curves: dict[str, Curve]) -> None:
